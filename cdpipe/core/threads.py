@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
+T = TypeVar("T")
+R = TypeVar("R")
 THREADS = 1
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
@@ -24,3 +29,12 @@ def allowed_threads() -> int:
     """
     named = os.environ.get(THREAD_VARIABLES[0], "")
     return max(int(named), 1) if named.isdecimal() else THREADS
+
+
+def in_threads(work: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """Return `work(item)` of every item, in order, by as many threads as are allowed.
+
+    Only work with the same result in any order may be done so, and it pays only where numpy or scipy does it.
+    """
+    with ThreadPoolExecutor(allowed_threads()) as pool:
+        return list(pool.map(work, items))

@@ -6,7 +6,7 @@ and accepts truncated ones.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ _TYPES = {
 }
 _BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 # Kind of an array -> its word in a header, and its bytes.
-_WRITTEN = {"f": ("float", "<f4"), "i": ("int", "<i4")}
+_WRITTEN = {"f": ("float", "<f4"), "i": ("int", "<i4"), "u": ("uint", "<u4")}
 _N_WORDS = {"format": 3, "element": 3, "property": 3}
 _MAX_HEADER_BYTES = 1 << 16
 _BLOCK = 10_000
@@ -50,12 +50,27 @@ def read_ply_points(path: Path) -> Float64Array:
     Raises:
         InputError: The file is missing, not PLY, cut short, or its vertices have no x, y, z.
     """
+    return read_ply(path)[0]
+
+
+def read_ply(path: Path, scalars: Sequence[str] = ()) -> tuple[Float64Array, dict[str, Float64Array]]:
+    """Read the (N, 3) vertices of a PLY file, and those of the named properties (N,) that it has, by their names.
+
+    Args:
+        path: The file.
+        scalars: Names of properties, in lower case; those of the file may have capitals.
+
+    Raises:
+        InputError: As `read_ply_points`.
+    """
     content = read_bytes(path)
     try:
         header = _parse_header(content)
-        return _vertices(content, header)
+        found = {name.lower(): name for name, _ in header.properties if name.lower() in scalars}
+        columns = _vertices(content, header, ["x", "y", "z", *found.values()])
     except (OverflowError, ValueError) as error:
         raise InputError(f"{path}: not a readable PLY scan: {error}") from error
+    return columns[:, :3].copy(), {name: columns[:, 3 + index].copy() for index, name in enumerate(found)}
 
 
 def write_ply_points(path: Path, points: Float64Array, scalars: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
@@ -103,19 +118,22 @@ def _parse_header(content: bytes) -> _Header:
     return _Header(encoding, n_vertices, tuple(properties), newline + 1)
 
 
-def _vertices(content: bytes, header: _Header) -> Float64Array:
+def _vertices(content: bytes, header: _Header, wanted: Sequence[str]) -> Float64Array:
+    """Return the wanted properties (N, P) of all vertices."""
     if header.n_vertices > len(content):
         raise ValueError(f"{header.n_vertices:.3g} vertices are announced in a file of {len(content)} bytes")
     names = [name for name, _ in header.properties]
     if header.encoding == "ascii":
         lines = content[header.size :].split(b"\n", header.n_vertices)[: header.n_vertices]
-        columns = [names.index(axis) for axis in "xyz"]
-        n_found, parts = 0, [np.zeros((0, 3))]
+        columns = [names.index(name) for name in wanted]
+        n_found, parts = 0, [np.zeros((0, len(wanted)))]
         # in blocks: a word as an object takes ten times its bytes
         for start in range(0, len(lines), _BLOCK):
             rows = [row for row in map(bytes.split, lines[start : start + _BLOCK]) if len(row) == len(names)]
             n_found += len(rows)
-            parts.append(np.array([[row[c] for c in columns] for row in rows], dtype=np.float64).reshape(-1, 3))
+            parts.append(
+                np.array([[row[c] for c in columns] for row in rows], dtype=np.float64).reshape(-1, len(wanted))
+            )
         if n_found == header.n_vertices:
             return np.concatenate(parts)
     else:
@@ -125,5 +143,5 @@ def _vertices(content: bytes, header: _Header) -> Float64Array:
         if n_found >= header.n_vertices:
             table = np.frombuffer(content, dtype, header.n_vertices, header.size)
             with np.errstate(invalid="ignore"):  # a NaN that signals; readers refuse any
-                return np.column_stack([table[f"{names.index(axis)}"] for axis in "xyz"]).astype(np.float64)
+                return np.column_stack([table[f"{names.index(name)}"] for name in wanted]).astype(np.float64)
     raise ValueError(f"{header.n_vertices} vertices are announced, {n_found} are there: it is damaged or cut short")

@@ -79,6 +79,7 @@ class RecordedScans:
     Attributes:
         name: The session's folder.
         odom_T_sensor: (S, 4, 4) pose of each revolution.
+        session: What is read.
         descriptors_in: Folder beside the recording that stores its descriptors; None for a session folder.
         is_temporary: Whether the folder goes with this object.
     """
@@ -89,7 +90,7 @@ class RecordedScans:
     def __init__(self, session: Session) -> None:
         self.name = str(session.path)
         self.odom_T_sensor = session.odom_T_sensor
-        self._session = session
+        self.session = session
         self._chunk_index = -1
         self._chunk: ScanChunk | None = None
 
@@ -99,17 +100,17 @@ class RecordedScans:
         Raises:
             InputError: Its chunk is damaged, its column poses are not rigid, or nothing returned.
         """
-        chunk_index, row = divmod(index, self._session.chunk_scans)
+        chunk_index, row = divmod(index, self.session.chunk_scans)
         if self._chunk is None or chunk_index != self._chunk_index:
-            self._chunk, self._chunk_index = self._session.chunk(chunk_index), chunk_index
-        where = f"{chunk_path(self._session.path, chunk_index)}: scan {index}"
+            self._chunk, self._chunk_index = self.session.chunk(chunk_index), chunk_index
+        where = f"{chunk_path(self.session.path, chunk_index)}: scan {index}"
         column_poses = self._chunk.column_poses[row].astype(np.float64)
         require_unit_poses(column_poses, lambda column: f"{where}, column {column}")
         range_mm = self._chunk.range_mm[row]
         is_hit = range_mm > 0
         if not is_hit.any():
             raise InputError(f"{where} holds no return: remove the scan and its pose from the recording")
-        points = deskew(self._session.sensor.project(range_mm / 1000.0), column_poses)
+        points = deskew(self.session.sensor.project(range_mm / 1000.0), column_poses)
         stamps = np.broadcast_to(self._chunk.column_stamps_ns[row], is_hit.shape)
         return PosedScan(
             index=index,
@@ -118,7 +119,8 @@ class RecordedScans:
             stamps_ns=stamps[is_hit],
             pixels=np.flatnonzero(is_hit).astype(np.int32),
             signal=self._chunk.signal[row][is_hit] if self._chunk.signal[row].any() else None,
-            second_from=is_hit.size // 2 if self._session.n_returns == 2 else None,
+            second_from=is_hit.size // 2 if self.session.n_returns == 2 else None,
+            intensity=self._chunk.reflectivity[row][is_hit].astype(np.float32),
         )
 
     def scans(self) -> Iterator[PosedScan]:
@@ -131,8 +133,8 @@ class RecordedScans:
         for index, pose in enumerate(self.odom_T_sensor):
             scan = self.scan(index)
             assert self._chunk is not None
-            row = index % self._session.chunk_scans
+            row = index % self.session.chunk_scans
             stamp_ns = int(self._chunk.column_stamps_ns[row, 0])
-            where = f"{chunk_path(self._session.path, self._chunk_index)}: scan {index}"
+            where = f"{chunk_path(self.session.path, self._chunk_index)}: scan {index}"
             repeats.require_new(where, f"scan {index}", self._chunk.range_mm[row], pose, stamp_ns)
             yield scan

@@ -9,7 +9,7 @@ others 2018).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -128,13 +128,7 @@ def drop_airborne(scan: PosedScan, lies_on_surface: LiesOnSurface | None = None)
     if lies_on_surface is not None:
         marked = np.flatnonzero(~kept)
         kept[marked[lies_on_surface(scan, marked)]] = True
-    return replace(
-        scan,
-        points_sensor=scan.points_sensor[kept],
-        stamps_ns=scan.stamps_ns[kept],
-        pixels=scan.pixels[kept],
-        signal=scan.signal[kept],
-    )
+    return scan.keep(kept)
 
 
 def _mark(scan: PosedScan, signal: npt.NDArray[np.uint16], rule: _Rule) -> BoolArray:

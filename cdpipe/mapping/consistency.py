@@ -67,14 +67,7 @@ class ConsistentScans(WrappedScans):
 
     def _corrected(self, scan: PosedScan) -> PosedScan:
         n = 0 if self._is_bent[scan.index] else len(scan.points_sensor)
-        return replace(
-            scan,
-            points_sensor=scan.points_sensor[:n],
-            odom_T_sensor=self._poses[scan.index],
-            stamps_ns=scan.stamps_ns[:n],
-            pixels=scan.pixels[:n],
-            signal=None if scan.signal is None else scan.signal[:n],
-        )
+        return replace(scan.keep(slice(n)), odom_T_sensor=self._poses[scan.index])
 
 
 def make_consistent(

@@ -223,8 +223,8 @@ class ExtractConfig(_Grown):
 class OutlierConfig(Settings):
     """Statistical outlier removal on the new points, (mu - lambda sigma, mu + lambda sigma)."""
 
-    neighbours: Count = Field(8, description="k")
-    sigmas: Positive = Field(2.0, description="lambda")
+    neighbours: Count = Field(8, description="k, neighbours of the outlier filter")
+    sigmas: Positive = Field(2.0, description="lambda, standard deviations that the outlier filter allows")
 
 
 class ClusterConfig(Settings):
@@ -237,7 +237,7 @@ class ClusterConfig(Settings):
 class VoxelDiffConfig(Settings):
     """Voxels of the whole maps."""
 
-    voxel_m: Cell = Field(0.5, description="`voxel-diff`: size")
+    voxel_m: Cell = Field(0.5, description="`voxel-diff`: edge of a voxel")
 
 
 class C2CConfig(Settings):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.geometry import (
+    BoolArray,
     Float32Array,
     Float64Array,
     Int8Array,
@@ -41,6 +42,7 @@ class PosedScan:
         pixels: (N,) int32 origin of each return: row * W + column, or the row of its file.
         signal: (N,) uint16 photons of each return, None where the sensor does not tell.
         second_from: Pixels from this one on are second returns of the beams from pixel 0 on; None: one return a beam.
+        intensity: (N,) float32 intensity of each return in the recording's own unit, None where it has none.
     """
 
     index: int
@@ -50,12 +52,26 @@ class PosedScan:
     pixels: Int32Array
     signal: npt.NDArray[np.uint16] | None = None
     second_from: int | None = None
+    intensity: Float32Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.points_sensor)
         require_shapes(self, points_sensor=(None, 3), odom_T_sensor=(4, 4), stamps_ns=(n,), pixels=(n,))
         if self.signal is not None:
             require_shapes(self, signal=(n,))
+        if self.intensity is not None:
+            require_shapes(self, intensity=(n,))
+
+    def keep(self, rows: BoolArray | slice) -> PosedScan:
+        """Return the scan with the returns of these rows alone."""
+        return replace(
+            self,
+            points_sensor=self.points_sensor[rows],
+            stamps_ns=self.stamps_ns[rows],
+            pixels=self.pixels[rows],
+            signal=None if self.signal is None else self.signal[rows],
+            intensity=None if self.intensity is None else self.intensity[rows],
+        )
 
 
 class ScanSource(Protocol):
@@ -164,16 +180,22 @@ class PointMap:
             require_shapes(self, recorded_T_sensor=self.odom_T_sensor.shape)
             require_poses("recorded_T_sensor", self.recorded_T_sensor)
 
-    def positions_of(self, returns: Int64Array) -> Float64Array:
-        """Return the (N, 3) positions of (N,) returns, the session's odom frame, metres, to 1/PLACES of a cell.
+    def positions_of(self, returns: Int64Array | slice) -> Float64Array:
+        """Return the (N, 3) positions of (N,) returns, or of a slice, the session's odom frame, metres.
+
+        They are known to 1/PLACES of a cell.
 
         Raises:
             ValueError: The map does not store them.
         """
         if self.return_offsets is None:
             raise ValueError("return_offsets is None: this map does not store the positions of its returns")
-        cells = np.floor(self.points[self.return_points[returns]] / self.voxel_m)
-        return (cells + (self.return_offsets[returns] + 0.5) / PLACES) * self.voxel_m
+        positions = self.points.take(self.return_points[returns], axis=0)
+        positions /= self.voxel_m
+        np.floor(positions, out=positions)
+        positions += (self.return_offsets[returns] + 0.5) / PLACES
+        positions *= self.voxel_m
+        return positions
 
     def scans_of(self, returns: Int64Array) -> Int64Array:
         """Return the (N,) scan of each of (N,) returns."""

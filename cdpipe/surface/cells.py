@@ -8,13 +8,15 @@ session sampled a place.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import Float32Array, Float64Array, transform, travelled_m
+from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, transform, travelled_m
+from cdpipe.core.threads import in_threads
 from cdpipe.core.voxel import cell_keys
-from cdpipe.model.types import MergedMaps, SessionName
+from cdpipe.model.types import MergedMaps, PointMap, SessionName
 from cdpipe.surface.motions import PathMotions
 
 CELL_M = 0.05
@@ -30,31 +32,37 @@ _RANGE_M, _BEAM_RAD = 0.015, np.deg2rad(0.09)
 _DRIFT = 0.01
 _REACH_M = 16.0
 _LEAST_RETURNS = 2
+# At most so many scans are averaged at once, and so many points moved.
+_SCANS, _BLOCK = 16, 1 << 18
+_NO_KEYS = np.zeros(0, dtype=np.int64)
+_NONE = np.zeros((0, 3)), np.zeros(0), np.zeros(0), _NO_KEYS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NearReturns:
-    """The returns of a session within 16 m.
+    """The returns of a session within 16 m. Those of one stretch of the path in one cell are averaged: N means.
 
     Attributes:
-        points: (N, 3) map frame, metres.
-        path_m: (N,) path position of the sensor at each, metres.
-        weights: (N,) inverse of the variance of each: noise of the range, width of the beam, drift.
+        points: (N, 3) weighted means, map frame, metres.
+        path_m: (N,) mean path position of the sensor, metres.
+        weights: (N,) sum of the inverse variances: noise of the range, width of the beam, drift.
+        counts: (N,) number of returns of each mean.
+        cell_of: (N,) number of the cell of each.
         map_T_sensor: (S, 4, 4) poses of the scans of the session.
     """
 
     points: Float64Array
     path_m: Float64Array
     weights: Float64Array
+    counts: Int64Array
+    cell_of: Int64Array
     map_T_sensor: Float64Array
 
     def without(self, motions: PathMotions) -> NearReturns:
-        """Return the returns with the motion of the scans taken off."""
-        points = self.points.copy()
-        for start in range(0, len(points), 1 << 20):
-            part = slice(start, start + (1 << 20))
-            points[part] -= motions.shifts(self.points[part], self.path_m[part])
-        return replace(self, points=points)
+        """Return the returns with the motion of the scans taken off. What was in one cell stays together."""
+        parts = [slice(start, start + _BLOCK) for start in range(0, len(self.points), _BLOCK)]
+        moved = in_threads(lambda part: self.points[part] - motions.shifts(self.points[part], self.path_m[part]), parts)
+        return replace(self, points=np.concatenate([self.points[:0], *moved]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,32 +86,63 @@ def near_returns(merged: MergedMaps, session: SessionName) -> NearReturns:
     """Return near returns of a session. A scan moves into the map frame as a whole, by the alignment at its pose."""
     point_map = merged.map_of(session)
     poses = point_map.odom_T_sensor
-    positions, path_m = poses[:, :3, 3], travelled_m(poses)
-    map_T_odom = np.tile(np.eye(4), (len(poses), 1, 1)) if session == "before" else merged.alignment.at(positions)
-    points, paths_m, weights = ([np.zeros(shape)] for shape in ((0, 3), (0,), (0,)))
-    for scan, (start, end) in enumerate(zip(point_map.scan_offsets[:-1], point_map.scan_offsets[1:], strict=True)):
-        found = point_map.positions_of(np.arange(start, end))
-        range_m = np.linalg.norm(found - positions[scan], axis=1)
+    path_m = travelled_m(poses)
+    map_T_odom = np.tile(np.eye(4), (len(poses), 1, 1)) if session == "before" else merged.alignment.at(poses[:, :3, 3])
+    parts = in_threads(partial(_average_stretch, point_map, map_T_odom, path_m), _stretches(path_m))
+    points, paths_m, weights, counts = (np.concatenate(each) for each in zip(_NONE, *parts, strict=True))
+    return NearReturns(points, paths_m, weights, counts, number_cells(points), map_T_odom @ poses)
+
+
+def number_cells(points: Float64Array) -> Int64Array:
+    """Return the number of the cell of each of (N, 3) points, in the order of the cells' keys."""
+    blocks = [points[start : start + _BLOCK] for start in range(0, len(points), _BLOCK)]
+    keys = np.concatenate([_NO_KEYS, *in_threads(partial(cell_keys, cell_m=CELL_M), blocks)])
+    return np.unique(keys, return_inverse=True)[1]
+
+
+def _stretches(path_m: Float64Array) -> list[range]:
+    """Return the scans of each stretch of the path. Scans of a sensor that stands are dealt out to several."""
+    stretch = np.floor(path_m / _FOLD_M)
+    starts = np.flatnonzero(np.append(True, stretch[1:] != stretch[:-1])[: len(path_m)])
+    ends = np.append(starts[1:], len(path_m))
+    return [
+        range(first, min(first + _SCANS, end))
+        for start, end in zip(starts, ends, strict=True)
+        for first in range(start, end, _SCANS)
+    ]
+
+
+def _average_stretch(
+    point_map: PointMap, map_T_odom: Float64Array, path_m: Float64Array, scans: range
+) -> tuple[Float64Array, Float64Array, Float64Array, Int64Array]:
+    """Return points, path positions, weights and counts of the means of some scans."""
+    points, weights, paths_m = [], [], []
+    for scan in scans:
+        found = point_map.positions_of(slice(*point_map.scan_offsets[scan : scan + 2]))
+        range_m = np.linalg.norm(found - point_map.odom_T_sensor[scan, :3, 3], axis=1)
         near = np.flatnonzero(range_m < _REACH_M)
         points.append(transform(map_T_odom[scan], found[near]))
+        weights.append(1.0 / (_RANGE_M**2 + (_BEAM_RAD**2 + _DRIFT**2) * range_m[near] ** 2))
         paths_m.append(np.full(len(near), path_m[scan]))
-        variance_m2 = _RANGE_M**2 + (_BEAM_RAD**2 + _DRIFT**2) * range_m[near] ** 2
-        weights.append(1.0 / variance_m2)
-    return NearReturns(np.concatenate(points), np.concatenate(paths_m), np.concatenate(weights), map_T_odom @ poses)
+    everywhere, weight, path = np.concatenate(points), np.concatenate(weights), np.concatenate(paths_m)
+    _, group = np.unique(cell_keys(everywhere, CELL_M), return_inverse=True)
+    summed: Float64Array = np.bincount(group, weight).astype(np.float64)
+    # from the stretch's start on, so that rounding moves no mean into the stretch before
+    start_m = np.floor(path_m[scans[0]] / _FOLD_M) * _FOLD_M
+    *means, since_start_m = (np.bincount(group, weight * each) / summed for each in (*everywhere.T, path - start_m))
+    return np.stack(means, axis=1), since_start_m + start_m, summed, np.bincount(group).astype(np.int64)
 
 
 def make_cells(returns: NearReturns) -> SurfaceCells:
     """Return the cells of a session. False returns lie alone: a cell of one return is left out."""
-    _, cell_of = np.unique(cell_keys(returns.points, CELL_M), return_inverse=True)
-    n = int(cell_of.max()) + 1 if len(cell_of) else 0
-    group = cell_of * N_FOLDS + np.floor(returns.path_m / _FOLD_M).astype(np.int64) % N_FOLDS
-    weights = np.bincount(group, returns.weights, n * N_FOLDS).reshape(n, N_FOLDS)
-    sums = np.stack(
-        [np.bincount(group, returns.weights * values, n * N_FOLDS) for values in returns.points.T], axis=-1
-    ).reshape(n, N_FOLDS, 3)
-    kept = np.flatnonzero(np.bincount(cell_of, minlength=n) >= _LEAST_RETURNS)
-    weights, sums = weights[kept], sums[kept]
-    points = sums.sum(axis=1) / weights.sum(axis=1, keepdims=True)
+    n = int(returns.cell_of.max(initial=-1)) + 1
+    group = returns.cell_of * N_FOLDS + np.floor(returns.path_m / _FOLD_M).astype(np.int64) % N_FOLDS
+    values = (returns.weights, *(returns.weights * axis for axis in returns.points.T))
+    kept = np.bincount(returns.cell_of, returns.counts, n) >= _LEAST_RETURNS
+    weights, *sums = in_threads(lambda each: np.bincount(group, each, n * N_FOLDS).reshape(n, N_FOLDS)[kept], values)
+    points = np.stack([each.sum(axis=1) for each in sums], axis=1) / weights.sum(axis=1, keepdims=True)
     with np.errstate(invalid="ignore"):
-        fold_offsets = (sums / weights[:, :, None] - points[:, None]).astype(np.float32)
-    return SurfaceCells(points, fold_offsets, cKDTree(points), returns.map_T_sensor)
+        fold_offsets = np.stack(
+            [(each / weights - points[:, axis, None]).astype(np.float32) for axis, each in enumerate(sums)], axis=-1
+        )
+    return SurfaceCells(points, fold_offsets, cKDTree(points, balanced_tree=False), returns.map_T_sensor)

@@ -19,9 +19,9 @@ from types import MappingProxyType
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.geometry import BoolArray, Float64Array
 from cdpipe.core.plugins import require_extra
-from cdpipe.model.config import PipelineConfig
+from cdpipe.model.config import PipelineConfig, SurfaceConfig
 from cdpipe.model.report import ChangedObject, SurfaceField
 from cdpipe.model.types import MergedMaps
 from cdpipe.surface.cells import NearReturns, SurfaceCells, make_cells, near_returns
@@ -43,13 +43,15 @@ from cdpipe.surface.unrolled import unroll
 _FLAT, _SMOOTH_M, _NEAR_M = 0.25, 0.03, 0.1
 # Places left so many standard deviations off have moved, and tell nothing about the scans.
 _TO_SIGMA, _OUTLIER = 1.4826, 4.0
+# Every fourth place tells which of them moved. The motions are fitted to thousands of places.
+_EVERY = 4
 # About so many returns of the after session tell the motions of its scans, each within that way of a place.
 _SAMPLE, _ON_PLACE_M, _SCAN_WINDOW_M = 400_000, 0.2, 4.0
 # Standard deviation of the tilt of scans that is left. It moves places by their distance from the path, which counts
 # where they are farther than the walls that the motions are fitted to, as beyond the ends of the path.
 _TILT_RAD, _CLOSE_M = 2e-3, 4.0
 # The variance of a mean from four folds is noisy: that of a place is the mean over its neighbours.
-_NEIGHBOURS = 24
+_NEIGHBOURS = 8
 # Share of the roughness that both spheres do not share, as standard deviation, and the least error of a mean.
 _ROUGHNESS, _LEAST_M = 0.18, 0.0004
 
@@ -68,6 +70,7 @@ def measure_surface(
     settings = config.surface
     before, after = (near_returns(merged, name) for name in ("before", "after"))
     cells = make_cells(before)
+    del before
     path = merged.before.odom_T_sensor
     places = choose_places(cells, path[:, :3, 3], settings.spacing_m, settings.normal_m)
     chainage_m, angle_deg, _ = unroll(places.points, path)
@@ -93,11 +96,8 @@ def measure_planes(
 ) -> Measured:
     """Measure the displacement by local planes, less what the alignment absorbed: our method."""
     settings = config.surface
-    found = measure_offsets(before, make_cells(after), places, settings.radius_m, with_variance=False)
-    told_m = _trust(places, found)
-    motions = fit_motions(places.points, places.normals, told_m, chainage_m, settings.window_m)
-    still = np.flatnonzero(_is_still(told_m - motions.along(places.points, places.normals, chainage_m)[0]))
-    laid = make_cells(after.without(_fit_scans(after, places, found.own_m, still)))
+    after = after.without(_fit_scans(before, after, places, chainage_m, settings))
+    laid = make_cells(after)
     found = measure_offsets(before, laid, places, settings.radius_m)
     motions = fit_motions(places.points, places.normals, _trust(places, found), chainage_m, settings.window_m)
     explained_m, alignment_m2 = motions.along(places.points, places.normals, chainage_m)
@@ -121,17 +121,26 @@ def _is_still(rest_m: Float64Array) -> BoolArray:
     return np.asarray(np.abs(rest_m) <= _OUTLIER * sigma_m)
 
 
-def _fit_scans(after: NearReturns, places: SurfacePlaces, own_m: Float64Array, still: Int64Array) -> PathMotions:
+def _fit_scans(
+    before: SurfaceCells, after: NearReturns, places: SurfacePlaces, chainage_m: Float64Array, settings: SurfaceConfig
+) -> PathMotions:
     """Return the motions of the after scans, by path position of the sensor, that lay their returns on still places."""
+    some = np.arange(0, len(places.points), _EVERY)
+    places = places.take(some)
+    found = measure_offsets(before, make_cells(after), places, settings.radius_m, with_variance=False)
+    told_m = _trust(places, found)
+    motions = fit_motions(places.points, places.normals, told_m, chainage_m[some], settings.window_m)
+    is_still = _is_still(told_m - motions.along(places.points, places.normals, chainage_m[some])[0])
+    still = np.flatnonzero(is_still)
     sample = np.arange(0, len(after.points), max(len(after.points) // _SAMPLE, 1))
     points = after.points[sample]
     if len(still) == 0:
         return fit_motions(points[:0], points[:0], points[:0, 0], points[:0, 0], _SCAN_WINDOW_M)
-    found = cKDTree(places.points[still]).query(points, distance_upper_bound=_ON_PLACE_M)
-    on = np.flatnonzero(np.isfinite(found[0]))
-    place = still[np.asarray(found[1], dtype=np.int64)[on]]
+    nearest = cKDTree(places.points[still]).query(points, distance_upper_bound=_ON_PLACE_M)
+    on = np.flatnonzero(np.isfinite(nearest[0]))
+    place = still[np.asarray(nearest[1], dtype=np.int64)[on]]
     normals = places.normals[place]
-    along_m = np.einsum("ij,ij->i", points[on] - places.points[place], normals) - own_m[place]
+    along_m = np.einsum("ij,ij->i", points[on] - places.points[place], normals) - found.own_m[place]
     return fit_motions(points[on], normals, along_m, after.path_m[sample[on]], _SCAN_WINDOW_M)
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array, Int64Array, plane_jacobian
+from cdpipe.core.threads import in_threads
 from cdpipe.core.voxel import cell_keys
 
 _STEP_M = 2.0
@@ -51,7 +52,9 @@ class PathMotions:
         shifts = np.zeros((len(points), 3))
         for station, share in self._around(path_m):
             turn, slide = self.motions[station, :3], self.motions[station, 3:]
-            shifts += share[:, None] * (np.cross(turn, points - self.centres[station]) + slide)
+            (a, b, c), (x, y, z) = turn.T, (points - self.centres[station]).T
+            turned = np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=1)
+            shifts += share[:, None] * (turned + slide)
         return shifts
 
     def along(
@@ -91,17 +94,18 @@ def fit_motions(
     points, normals, along_m, path_m = points[order], normals[order], along_m[order], path_m[order]
     first_m, last_m = (float(path_m[0]), float(path_m[-1])) if len(path_m) else (0.0, 0.0)
     stations_m = np.arange(first_m, last_m + _STEP_M, _STEP_M)
-    centres, motions = np.zeros((len(stations_m), 3)), np.zeros((len(stations_m), 6))
-    covariances = np.full((len(stations_m), 6, 6), np.nan)
-    for number, station_m in enumerate(stations_m):
+
+    def fit(station_m: float) -> tuple[Float64Array, Float64Array, Float64Array]:
         used = slice(*np.searchsorted(path_m, (station_m - window_m, station_m + window_m)))
         if used.stop - used.start < _LEAST_OFFSETS:
-            continue
+            return np.zeros(3), np.zeros(6), np.full((6, 6), np.nan)
         share = np.maximum(1 - ((path_m[used] - station_m) / window_m) ** 2, 0.0)
-        centres[number] = points[used].mean(axis=0)
-        jacobian = plane_jacobian(points[used] - centres[number], normals[used])
-        motions[number], covariances[number] = _fit(jacobian, along_m[used], share, points[used])
-    return PathMotions(first_m, centres, motions, covariances)
+        centre = points[used].mean(axis=0)
+        jacobian = plane_jacobian(points[used] - centre, normals[used])
+        return centre, *_fit(jacobian, along_m[used], share, points[used])
+
+    centres, motions, covariances = zip(*in_threads(fit, stations_m), strict=True)
+    return PathMotions(first_m, np.stack(centres), np.stack(motions), np.stack(covariances))
 
 
 def _fit(

@@ -6,20 +6,23 @@ hold the same humps and hollows. A place at which the after surface lies far off
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.core.threads import allowed_threads
+from cdpipe.core.threads import in_threads
 from cdpipe.surface.cells import N_FOLDS, SurfaceCells
 from cdpipe.surface.places import SurfacePlaces
 
 # Spheres that hold too few cells are widened: a roof is sampled more thinly than a wall.
 _WIDENINGS = (1.0, 1.5, 2.0)
-_NEAREST = 100
+_NEAREST = 120
+# Cells are looked for in a sphere larger by this factor: the second sphere of a place takes them from the same search.
+_SLACK = 1.15
+# Variances are averaged over neighbouring places, and spheres overlap: every fourth place has one.
+_EVERY = 4
 _LEAST_CELLS = 12
 _LEAST_OF_FOLD = 3
 _BLOCK = 1 << 14
@@ -43,7 +46,7 @@ class Offsets:
         along_m: (Q,) offset of the after surface from the before surface, along the normal; NaN where either session
             has too few cells.
         nearest_m: (Q,) the same by the distance to the nearest cell of the after surface, where that is far.
-        variance_m2: (Q,) variance of `along_m`, from the differences between folds; NaN if unknown.
+        variance_m2: (Q,) variance of `along_m`, from the differences between folds, of every fourth place; else NaN.
         own_m: (Q,) mean height of the before surface around each place, along the normal; NaN as `along_m`.
     """
 
@@ -93,7 +96,7 @@ def measure_offsets(
 
 def _find_surface(after: SurfaceCells, places: SurfacePlaces) -> Float64Array:
     """Return the (Q,) height along the normal at which the after surface is near; NaN where it is nowhere."""
-    start_m = np.where(after.tree.query(places.points)[0] <= _NEAR_M, 0.0, np.nan)
+    start_m = np.where(after.tree.query(places.points, distance_upper_bound=_NEAR_M)[0] <= _NEAR_M, 0.0, np.nan)
     rest = np.flatnonzero(np.isnan(start_m))
     for step in range(1, int(_INTO_ROCK_M / _STEP_M) + 1):
         for height_m in (step * _STEP_M, -step * _STEP_M):
@@ -115,50 +118,67 @@ def _settle(
     *,
     with_variance: bool,
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the (N,) mean height along the normals in a sphere, and its variance.
+    """Return the (N,) mean height along the normals in a sphere, NaN of too few cells, and its variance, or NaN.
 
     The first sphere stands `start_m` above each of the (N, 3) points, the second on the surface that the first found.
     Both sessions settle alike: at an edge the second sphere holds other cells than the first.
     """
-    heights_m, variance_m2 = start_m, np.zeros(len(points))
-    for is_last in (False, True):
-        centres = points + np.nan_to_num(heights_m)[:, None] * normals
-        shift_m, variance_m2 = _average(cells, centres, normals, radius_m, with_variance and is_last)
-        heights_m = heights_m + shift_m
-    return heights_m, variance_m2
-
-
-def _average(
-    cells: SurfaceCells, centres: Float64Array, normals: Float64Array, radius_m: float, with_variance: bool
-) -> tuple[Float64Array, Float64Array]:
-    """Return the (N,) mean height of the cells around each (N, 3) centre, NaN of too few, and its variance, or NaN."""
-    blocks = [slice(start, start + _BLOCK) for start in range(0, len(centres), _BLOCK)]
-    with ThreadPoolExecutor(allowed_threads()) as pool:
-        averaged = partial(_average_block, cells, radius_m, with_variance)
-        parts = list(pool.map(averaged, (centres[rows] for rows in blocks), (normals[rows] for rows in blocks)))
+    blocks = [slice(start, start + _BLOCK) for start in range(0, len(points), _BLOCK)]
+    settle = partial(_settle_block, cells, radius_m, with_variance)
+    parts = in_threads(lambda rows: settle(points[rows], normals[rows], start_m[rows]), blocks)
     heights_m, variance_m2 = zip(*parts, strict=True) if parts else ((np.zeros(0),), (np.zeros(0),))
     return np.concatenate(heights_m), np.concatenate(variance_m2)
 
 
-def _average_block(
-    cells: SurfaceCells, radius_m: float, with_variance: bool, centres: Float64Array, normals: Float64Array
+def _settle_block(
+    cells: SurfaceCells,
+    radius_m: float,
+    with_variance: bool,
+    points: Float64Array,
+    normals: Float64Array,
+    start_m: Float64Array,
 ) -> tuple[Float64Array, Float64Array]:
-    distance_m, index = cells.tree.query(centres, k=_NEAREST, distance_upper_bound=radius_m)
-    is_found = np.isfinite(distance_m)
-    index = np.where(is_found, index, 0)
-    counts = is_found.sum(axis=1)
-    offsets = cells.points.take(index, axis=0) - centres[:, None]
-    heights_m = np.einsum("nki,ni->nk", offsets, normals) * is_found
-    mean_m = heights_m.sum(axis=1) / np.maximum(counts, 1)
-    variance_m2 = _vary(cells, index, is_found, normals) if with_variance else np.full(len(centres), np.nan)
-    return np.where(counts >= _LEAST_CELLS, mean_m, np.nan), variance_m2
+    """Settle some spheres. Both spheres of a place take their cells from one search, but where they lie far apart."""
+    distance_m, index, heights_m = _look_around(cells, points, normals, start_m, _SLACK * radius_m)
+    settled_m = _average(heights_m, distance_m <= radius_m)
+    shift_m = settled_m - start_m
+    squared_m2 = distance_m**2 - 2 * shift_m[:, None] * (heights_m - start_m[:, None]) + shift_m[:, None] ** 2
+    far = np.flatnonzero(np.abs(shift_m) > (_SLACK - 1) * radius_m)
+    distance_m, index[far], heights_m[far] = _look_around(cells, points[far], normals[far], settled_m[far], radius_m)
+    squared_m2[far] = distance_m**2
+    is_inside = squared_m2 <= radius_m**2
+    variance_m2, some = np.full(len(points), np.nan), slice(None, None, _EVERY)
+    if with_variance:
+        variance_m2[some] = _vary(cells, index[some], is_inside[some], normals[some])
+    return _average(heights_m, is_inside), variance_m2
+
+
+def _look_around(
+    cells: SurfaceCells, points: Float64Array, normals: Float64Array, start_m: Float64Array, reach_m: float
+) -> tuple[Float64Array, Int64Array, Float64Array]:
+    """Return (N, K) distance, infinite without a cell, index, and height over the point, of the cells at each sphere.
+
+    The spheres stand (N,) `start_m` above the (N, 3) points.
+    """
+    centres = points + start_m[:, None] * normals
+    distance_m, index = cells.tree.query(centres, k=_NEAREST, distance_upper_bound=reach_m)
+    index = np.where(np.isfinite(distance_m), index, 0)
+    offsets = cells.points.take(index, axis=0) - points[:, None]
+    return np.asarray(distance_m), index.astype(np.int64), np.einsum("nki,ni->nk", offsets, normals)
+
+
+def _average(heights_m: Float64Array, is_inside: BoolArray) -> Float64Array:
+    """Return the (N,) mean of the heights inside, NaN of too few."""
+    counts = is_inside.sum(axis=1)
+    sums_m = np.einsum("nk,nk->n", heights_m, is_inside)
+    return np.where(counts >= _LEAST_CELLS, sums_m / np.maximum(counts, 1), np.nan)
 
 
 def _vary(cells: SurfaceCells, index: Int64Array, is_found: BoolArray, normals: Float64Array) -> Float64Array:
     """Return the (N,) variance of a mean height by the differences between folds; NaN with fewer than two folds."""
     means_m = np.full((len(index), N_FOLDS), np.nan)
     for fold in range(N_FOLDS):
-        heights_m = np.einsum("nki,ni->nk", cells.fold_offsets[:, fold].take(index, axis=0), normals)
+        heights_m = np.einsum("nki,ni->nk", cells.fold_offsets[index, fold], normals)
         is_known = is_found & np.isfinite(heights_m)
         counts = is_known.sum(axis=1)
         sums = np.where(is_known, heights_m, 0.0).sum(axis=1)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.core.threads import in_threads
 from cdpipe.core.voxel import cell_means
 from cdpipe.surface.cells import CELL_M, SurfaceCells
 
@@ -38,6 +39,10 @@ class SurfacePlaces:
     areas_m2: Float64Array
     seen_from_m: Float64Array
 
+    def take(self, chosen: Int64Array) -> SurfacePlaces:
+        """Return the chosen places, each with its own area."""
+        return SurfacePlaces(*(getattr(self, each.name)[chosen] for each in fields(self)))
+
 
 def choose_places(before: SurfaceCells, path: Float64Array, spacing_m: float, normal_m: float) -> SurfacePlaces:
     """Return the cell nearest to the mean of the cells of each voxel, where there are enough of them for a plane.
@@ -53,7 +58,8 @@ def choose_places(before: SurfaceCells, path: Float64Array, spacing_m: float, no
     means, _ = cell_means(before.points, spacing_m)
     chosen = np.unique(before.tree.query(means)[1])
     points = before.points[chosen]
-    parts = [_fit_planes(before, points[start : start + _BLOCK], normal_m) for start in range(0, len(points), _BLOCK)]
+    blocks = [points[start : start + _BLOCK] for start in range(0, len(points), _BLOCK)]
+    parts = in_threads(lambda block: _fit_planes(before, block, normal_m), blocks)
     if not parts:
         none = np.zeros(0)
         return SurfacePlaces(np.zeros((0, 3)), np.zeros((0, 3)), none, none, none, none)

@@ -1,29 +1,46 @@
-"""`tunnelcd convert`: a session becomes an OSF or a folder of PCD files; a recording becomes a session."""
+"""`tunnelcd convert`: sessions, answers and worlds in formats of other tools; a recording becomes a session."""
 
 # ruff: noqa: PLC0415 - heavy imports stand inside the functions, so that --help and completion are instant
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from eval.cli.inputs import RECORDING, Deskew, Format, Metadata, Odometry, Topics, Trajectories, how_to_read
-from eval.cli.options import Quiet
+from eval.cli.inputs import (
+    RECORDING,
+    Deskew,
+    Format,
+    Metadata,
+    Odometry,
+    Topics,
+    Trajectories,
+    how_to_read,
+    open_inputs,
+    open_sources,
+)
+from eval.cli.options import Quiet, SetSettings
 from eval.core.printing import say, shown_warnings
 from eval.core.progress import RunProgress, shown_progress
 
 if TYPE_CHECKING:
     from cdpipe.io.foreign import HowToRead
-    from cdpipe.io.session import Session
 
-GT_CLOUD = "gt_cloud.pcd"
 _FEW_SCANS = 10
+_ANSWER = 3  # inputs of an answer's map: before, after, answer
 
 
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="SRC", help=RECORDING)],
-    out: Annotated[Path, typer.Argument(metavar="DST", help="new .osf file or folder of .pcd files; or new session")],
+    sources: Annotated[
+        list[Path],
+        typer.Argument(metavar="SRC...", help=f"{RECORDING}; or BEFORE AFTER ANSWER; or a scenario, for a .glb"),
+    ],
+    out: Annotated[Path, typer.Argument(metavar="DST", help="new file, whose ending tells the format, or new folder")],
+    to: Annotated[
+        str | None, typer.Option("--to", metavar="NAME", help="format, where the ending does not tell (CONVERT.md)")
+    ] = None,
     metadata: Metadata = None,
     trajectory: Trajectories = None,
     odometry: Odometry = None,
@@ -31,39 +48,108 @@ def convert(
     topics: Topics = None,
     deskew: Deskew = True,
     with_truth: Annotated[
-        bool, typer.Option("--with-truth/--without-truth", help="LABEL and INSTANCE in the .osf; gt_cloud.pcd")
+        bool, typer.Option("--with-truth/--without-truth", help="the truth of a simulated session leaves, too")
     ] = False,
+    cell_m: Annotated[float, typer.Option("--cell", min=0.01, help="one point per cell of a map, metres")] = 0.05,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="seed of a scenario; 0 if left out", show_default=False)
+    ] = None,
+    settings: SetSettings = None,
     quiet: Quiet = False,
 ) -> None:
-    """Convert a session to OSF for the vendor's SDK, or to PCD files; or a recording to a session.
+    """Convert a session, an answer or a world to a format of other tools; or a recording to a session.
 
-    An OSF or PCAP becomes a session folder; scans of any other format become a folder of deskewed PLY scans with a TUM
-    trajectory, which all commands take as a session.
+    DST ends in .osf .pcap .mcap .bag .tum .kitti .laz .las .ply .rrd or .glb, or is a folder: of PCD files, or what
+    --to says (ros2, semantic-kitti). A recording and a folder: an OSF or PCAP becomes a session folder, any other
+    format deskewed PLY scans with a TUM trajectory, which all commands take as a session.
 
-    A folder of PCD files has the layout of DynamicMap_Benchmark: pcd/000000.pcd and so on, the points in one frame, and
-    gt_cloud.pcd with the truth, where what moves has intensity 1.
+    BEFORE AFTER ANSWER become one map with scalar fields, .laz or .ply. A scenario becomes a .glb.
     """
     from cdpipe.core.errors import InputError
     from cdpipe.io.foreign import HowToRead, guess_format
-    from cdpipe.io.readers import RECORDING_SUFFIXES
-    from cdpipe.io.session import is_session
 
-    (how,) = how_to_read(1, form, topics, trajectory, odometry, metadata, deskew=deskew)
-    if is_session(source) or is_session(source / "before"):
-        if how != HowToRead():
-            given = {"metadata": metadata, "trajectory": trajectory, "odometry": odometry, "format": form}
-            name = next((name for name, value in given.items() if value is not None), "topic")
-            raise InputError(f"{source}: a session has its own poses and sensor: leave --{name} out")
-        with shown_progress(quiet) as progress:
-            say(quiet, _export(source, out, progress, with_truth=with_truth))
-        return
-    name = how.format or guess_format(source)
+    if len(sources) not in (1, _ANSWER):
+        raise InputError(f"{len(sources)} inputs: expected one, or BEFORE AFTER ANSWER, and then the output")
+    hows = how_to_read(min(len(sources), 2), form, topics, trajectory, odometry, metadata, deskew=deskew)
+    with shown_warnings(), shown_progress(quiet) as progress:
+        if len(sources) == _ANSWER:
+            _refuse_truth(sources[-1], with_truth)
+            say(quiet, _convert_answer(sources, out, to, hows, cell_m, progress))
+            return
+        source = sources[0]
+        if _is_world(source, out, to):
+            if hows != [HowToRead()]:
+                raise InputError(f"{source}: a world has no recording to read: leave --trajectory and the like out")
+            say(quiet, _convert_world(source, out, to, seed, settings or (), with_truth=with_truth))
+            return
+        if seed is not None or settings:
+            raise InputError(f"{source}: a session holds what was recorded: leave --seed and --set out")
+        if _is_session(source, hows[0]):
+            say(quiet, _export(source, out, to, None, progress, cell_m, with_truth=with_truth))
+            return
+        name = hows[0].format or guess_format(source)
+        _refuse_truth(source, with_truth)
+        if out.suffix or to is not None:
+            say(quiet, _export(source, out, to, hows[0], progress, cell_m, with_truth=False))
+        else:
+            say(quiet, _import(source, out, name, hows[0], progress))
+
+
+def _refuse_truth(source: Path, with_truth: bool) -> None:
+    from cdpipe.core.errors import InputError
+
     if with_truth:
         raise InputError(f"{source}: a recording has no truth: leave --with-truth out")
-    if out.suffix.lower() in RECORDING_SUFFIXES:
-        raise InputError(f"{out}: a recording becomes a session: name a new folder")
-    with shown_progress(quiet) as progress:
-        say(quiet, _import(source, out, name, how, progress))
+
+
+def _is_world(source: Path, out: Path, to: str | None) -> bool:
+    """Return whether a GLB is asked for, or what is named is a scenario and no file or folder of recordings."""
+    from eval.converting.formats import FORMATS
+    from scenarios import scenario_names
+
+    is_scenario = not source.is_dir() and (source.suffix in (".yaml", ".yml") or str(source) in scenario_names())
+    return is_scenario or to == "glb" or (to is None and out.suffix.lower() in FORMATS["glb"].suffixes)
+
+
+def _is_session(source: Path, how: HowToRead) -> bool:
+    """Return whether a folder is a session of ours.
+
+    Raises:
+        InputError: It is a pair, an answer, or a session with options of a recording.
+    """
+    from cdpipe.core.errors import InputError
+    from cdpipe.io.foreign import HowToRead
+    from cdpipe.io.session import is_session
+
+    if (source / "answer.json").is_file():
+        raise InputError(f"{source}: an answer, without its sessions: `tunnelcd convert BEFORE AFTER {source} map.laz`")
+    if is_session(source / "before"):
+        raise InputError(f"{source}: a pair of sessions: convert {source / 'before'} and {source / 'after'} one by one")
+    if is_session(source) and how != HowToRead():
+        given = {"metadata": how.metadata, "trajectory": how.trajectory, "odometry": how.odometry, "format": how.format}
+        name = next((name for name, value in given.items() if value is not None), "topic")
+        raise InputError(f"{source}: a session has its own poses and sensor: leave --{name} out")
+    return is_session(source)
+
+
+def _convert_answer(
+    sources: Sequence[Path], out: Path, to: str | None, hows: Sequence[HowToRead], cell_m: float, progress: RunProgress
+) -> str:
+    from eval.converting.formats import choose_format
+    from eval.converting.writing import write_answer_map
+
+    name = choose_format(out, to)
+    before, after = open_sources(*open_inputs(sources[:2], hows, progress))
+    return write_answer_map((before, after), sources[2], out, name, cell_m, progress)
+
+
+def _convert_world(
+    source: Path, out: Path, to: str | None, seed: int | None, settings: Sequence[str], *, with_truth: bool
+) -> str:
+    from eval.converting.formats import choose_format
+    from eval.converting.writing import write_world
+
+    return write_world(str(source), out, choose_format(out, to), seed, settings, with_truth=with_truth)
 
 
 def _import(source: Path, out: Path, name: str, how: HowToRead, progress: RunProgress) -> str:
@@ -73,7 +159,7 @@ def _import(source: Path, out: Path, name: str, how: HowToRead, progress: RunPro
     from eval.core.output import made_parents, new_folder
 
     if name not in OUSTER:
-        with shown_warnings(), new_folder(out) as partial:
+        with new_folder(out) as partial:
             n_scans, poses = convert_recording(source, partial, how, progress.stage)
         told = "1 scan" if n_scans == 1 else f"{n_scans} scans"
         return f"{out}: {told} as PLY, trajectory.tum, poses: {poses}{_too_short(n_scans)}"
@@ -86,7 +172,8 @@ def _import(source: Path, out: Path, name: str, how: HowToRead, progress: RunPro
             odometry=how.odometry,
             on_progress=progress.stage,
         )
-    told = f"{out}: session of {_revolutions(imported.n_scans)}, {imported.sensor}, poses: {imported.poses}"
+    revolutions = "1 revolution" if imported.n_scans == 1 else f"{imported.n_scans} revolutions"
+    told = f"{out}: session of {revolutions}, {imported.sensor}, poses: {imported.poses}"
     if imported.n_left_out:
         told += f"; {imported.n_left_out} left out, of which half the columns or fewer arrived"
     return told + _too_short(imported.n_scans)
@@ -99,74 +186,28 @@ def _too_short(n_scans: int) -> str:
     return "; so few are one place, seldom enough to compare: record a path of ten metres or more, twice"
 
 
-def _export(source: Path, out: Path, progress: RunProgress, *, with_truth: bool) -> str:
+def _export(
+    source: Path,
+    out: Path,
+    to: str | None,
+    how: HowToRead | None,
+    progress: RunProgress,
+    cell_m: float,
+    *,
+    with_truth: bool,
+) -> str:
+    """Write a session, or a recording that is read as `how` says, in another format."""
     from cdpipe.core.errors import InputError
-    from cdpipe.io.session import is_session, read_session
-
-    if out.suffix.lower() not in ("", ".osf"):
-        raise InputError(f"{out}: a session becomes an OSF, a new file that ends in .osf, or a new folder of PCD files")
-    if is_session(source / "before"):
-        raise InputError(f"{source}: a pair of sessions: convert {source / 'before'} and {source / 'after'} one by one")
-    session = read_session(source)
-    if with_truth and not (source / "truth").is_dir():
-        raise InputError(f"{source}: there is no truth in it: leave --with-truth out")
-    write, kept = (_write_osf, "with truth as fields LABEL and INSTANCE") if out.suffix else (
-        _write_pcds, f"and what moves is 1 in {GT_CLOUD}")  # fmt: skip
-    size = write(session, out, progress, with_truth=with_truth)
-    return f"{out}: {_revolutions(session.n_scans)}, {kept if with_truth else 'without truth'}, {size / 1e6:.1f} MB"
-
-
-def _write_osf(session: Session, out: Path, progress: RunProgress, *, with_truth: bool) -> int:
-    """Write a session as OSF; return its size in bytes."""
-    from dataclasses import replace
-
-    import numpy as np
-
-    from cdpipe.io.ouster.osf import write_osf
-    from eval.core.output import made_parents
-    from sim.session.truth import read_labels
-
-    if not with_truth:  # a profile of one's own is a path, which can tell the scenario
-        told = {name: value for name, value in session.provenance.items() if name != "sensor_profile"}
-        session = replace(session, provenance=told)
-    # LABEL is the change's id, 0 none, 65535 for the -1 of mixed returns; INSTANCE is as in sim.session.truth
-    labels = read_labels(session.path, session.n_chunks)
-    fields = ({"LABEL": of.astype(np.uint16), "INSTANCE": instance.astype(np.int16)} for instance, of in labels)
-    with made_parents(out):
-        write_osf(session, out, fields if with_truth else None, progress.stage)
-    return out.stat().st_size
-
-
-def _write_pcds(session: Session, out: Path, progress: RunProgress, *, with_truth: bool) -> int:
-    """Write a session as PCD files, one a revolution, into a new folder; return their size in bytes.
-
-    The truth is one file of one return per 0.1 m cell: intensity 1 on what moves while the session is recorded, else 0.
-    """
-    from itertools import chain
-
-    import numpy as np
-
-    from cdpipe.core.geometry import transform
-    from cdpipe.io.pcd import write_pcd
     from cdpipe.io.readers import open_session
-    from eval.core.output import new_folder
-    from eval.truth.scoring_points import build_scoring_points
-    from sim.session.truth import read_pair_truth
+    from cdpipe.io.session import read_session
+    from eval.converting.formats import FORMATS, choose_format
+    from eval.converting.request import Request
+    from eval.converting.writing import write_session
 
-    movers = [mover.instance for mover in read_pair_truth(session.path.parent).movers] if with_truth else None
-    counts = chain.from_iterable(chunk.reflectivity for chunk in session.chunks())
-    with new_folder(out) as folder:
-        (folder / "pcd").mkdir()
-        for scan, reflectivity in zip(open_session(session.path).scans(), counts, strict=True):
-            points_odom = transform(scan.odom_T_sensor, scan.points_sensor)
-            path = folder / "pcd" / f"{scan.index:06d}.pcd"
-            write_pcd(path, points_odom, reflectivity.ravel()[scan.pixels], scan.odom_T_sensor)
-            progress.stage("write", scan.index + 1, session.n_scans)
-        if movers is not None:
-            points = build_scoring_points(session)
-            write_pcd(folder / GT_CLOUD, points.points_odom.astype(np.float64), np.isin(points.instance, movers))
-        return sum(path.stat().st_size for path in folder.rglob("*.pcd"))
-
-
-def _revolutions(n: int) -> str:
-    return "1 revolution" if n == 1 else f"{n} revolutions"
+    name = choose_format(out, to)
+    if how is not None and FORMATS[name].is_ours_alone:
+        raise InputError(f"{out}: a recording becomes a session: name a new folder, and convert that session")
+    opened = open_session(source, how, progress.stage)
+    session = read_session(source) if how is None else None
+    request = Request(opened, session, progress, with_truth, cell_m)
+    return write_session(request, out, name)

@@ -187,6 +187,17 @@ def point_file() -> str:
     return "writes and reads a PCD file"
 
 
+def recording() -> str:
+    """Let Rerun record a point in memory (rerun-sdk)."""
+    import rerun as rr
+
+    with rr.RecordingStream("tunnelcd") as stream:
+        memory = rr.memory_recording(recording=stream)
+        stream.log("point", rr.Points3D([[1.0, 2.0, 3.0]]))
+        _require(memory.num_msgs() > 0, "a point that was logged is not in the recording")
+    return "records a point"
+
+
 def sdk() -> str:
     """Let the vendor's SDK load (ouster-sdk)."""
     from cdpipe.io.ouster.sdk import require_sdk
@@ -233,6 +244,7 @@ OF_EXTRA: dict[str, Callable[[], str]] = {
     "dufomap": void,
     "octomap": free_space,
     "formats": point_file,
+    "rerun": recording,
     "cluster": cluster,
 }
 

@@ -11,13 +11,18 @@ from typing import Annotated, Literal
 
 import typer
 
-from eval.cli.options import Quiet, RunOut
+from eval.cli.options import Quiet, RunOut, complete_plan
 from eval.core.printing import count_pairs, echo, say
 from eval.core.progress import shown_progress
 
 
 def evaluate(
-    plan: Annotated[str, typer.Option("--plan", help="name from `list`, or a .yaml file", show_default=False)],
+    plan: Annotated[
+        str,
+        typer.Option(
+            "--plan", help="name from `list`, or a .yaml file", show_default=False, autocompletion=complete_plan
+        ),
+    ],
     command: Annotated[
         str,
         typer.Option(

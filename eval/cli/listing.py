@@ -93,7 +93,10 @@ def _unit(key: str, field: FieldInfo) -> str:
     limits = {type(limit).__name__: getattr(limit, type(limit).__name__.lower()) for limit in _limits(field)}
     if limits.get("Ge") == 0 and limits.get("Le") == 1:
         return "share"
-    return {int: "number", float: "factor", str: "text"}.get(type(field.default), "")
+    # a number, or nothing; the number may be annotated
+    if any(int in (part, *get_args(part)) for part in get_args(field.annotation)):
+        return "number | null"
+    return {int: "number", float: "factor", str: "text", dict: "keys and values"}.get(type(field.default), "")
 
 
 def _limits(field: FieldInfo) -> list[Any]:

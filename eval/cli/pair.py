@@ -21,7 +21,7 @@ from eval.cli.inputs import (
     open_inputs,
     open_sources,
 )
-from eval.cli.options import KindOfSite, OutFolder, Preset, Quiet, SetSettings
+from eval.cli.options import KindOfSite, OutFolder, Preset, Quiet, SetSettings, require_method_settings
 from eval.cli.printed_answer import LINE, print_answer
 from eval.core.printing import echo, print_table, say, shown_warnings
 from eval.core.progress import shown_progress
@@ -50,6 +50,7 @@ def describe(
     """Compute a session's descriptors and store them beside it, as a robot would while mapping."""
     import cdpipe
 
+    require_method_settings(settings)
     hows = how_to_read(1, form, topics, trajectory, odometry, metadata, deskew=deskew)
     with shown_warnings(), shown_progress(quiet) as progress:
         (source,) = open_inputs([session], hows, progress)
@@ -91,6 +92,7 @@ def detect(
     from cdpipe.mapping.session_check import is_same_session
     from eval.core.output import new_folder
 
+    require_method_settings(settings)
     settings = [*(["surface.method=planes"] if surface else []), *(settings or [])]
     config = cdpipe.load_config(preset, settings, site)
     known = _read_known_merge(before_T_after, assume_aligned=assume_aligned)

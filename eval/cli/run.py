@@ -10,9 +10,22 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from eval.cli.options import AsJson, Quiet, RunOut, Scheduler, SetSettings, Workers
+from eval.cli.options import (
+    AsJson,
+    JsonFile,
+    Quiet,
+    RunOut,
+    Scheduler,
+    SetSettings,
+    Workers,
+    complete_method,
+    complete_plan,
+    complete_preset,
+    complete_setting,
+    require_method_settings,
+)
 from eval.cli.printed_results import print_comparison, print_results
-from eval.core.printing import echo, echo_json, print_row, say, warn
+from eval.core.printing import echo, print_row, require_json_file, say, tell_json, warn
 from eval.core.progress import shown_progress
 
 if TYPE_CHECKING:
@@ -34,7 +47,7 @@ def demo(out: RunOut, quiet: Quiet = False) -> None:
 
 
 def run_command(
-    plan: Annotated[str, typer.Argument(help="name from `list`, or a .yaml file")],
+    plan: Annotated[str, typer.Argument(help="name from `list`, or a .yaml file", autocompletion=complete_plan)],
     out: RunOut,
     seeds: Annotated[str | None, typer.Option(metavar="A:B", help="replaces the plan's seeds; B excluded")] = None,
     split: Annotated[
@@ -43,12 +56,21 @@ def run_command(
     ] = "dev",
     preset: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="run this preset in place of the plan's variants; may be repeated"),
+        typer.Option(
+            metavar="NAME",
+            help="run this preset in place of the plan's variants; may be repeated",
+            autocompletion=complete_preset,
+        ),
     ] = None,
     settings: SetSettings = None,
     grid: Annotated[
         list[str] | None,
-        typer.Option("--grid", metavar="KEY=V1,V2", help="run every variant at each value; may be repeated"),
+        typer.Option(
+            "--grid",
+            metavar="KEY=V1,V2",
+            help="run every variant at each value; may be repeated",
+            autocompletion=complete_setting,
+        ),
     ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
@@ -75,6 +97,7 @@ def run_command(
     from eval.plans.plan import load_plan
     from eval.running.scaling.shards import parse_shard
 
+    require_method_settings([*(settings or ()), *(grid or ())], "write it into the plan, as `set` of a scenario")
     chosen = change_plan(
         load_plan(plan), seeds=seeds, split=split, presets=preset or (), settings=settings or (), grid=grid or ()
     )
@@ -130,11 +153,13 @@ def score(
         str | None, typer.Option("--as", metavar="NAME", help="their variant in the tables", show_default=False)
     ] = None,
     as_json: AsJson = False,
+    out: JsonFile = None,
     quiet: Quiet = False,
 ) -> None:
     """Score stored answers against the truth again, or the answers of another program; no method is run."""
     from cdpipe.core.errors import InputError
 
+    require_json_file(out)
     if (predictions is None) != (name is None):
         raise InputError("--predictions and --as: a run takes predictions under a name: give both, or neither")
     if answer is not None:
@@ -145,9 +170,8 @@ def score(
 
         with shown_progress(quiet) as progress, remade_below([folder], progress):
             row = score(answer, folder)
-        if as_json:
-            echo_json(row)
-        elif not quiet:
+        tell_json(row, as_json=as_json, file=out)
+        if not as_json and not quiet:
             print_row(row)
         return
     from eval.running.predictions import add_predictions
@@ -160,10 +184,11 @@ def score(
             n_scored, told = add_predictions(run, predictions, name, progress), f"predictions scored as {name}"
         else:
             n_scored, told = rescore(run, progress), "answers scored again"
-    if as_json:
+    if as_json or out is not None:
         import pandas as pd
 
-        echo_json(pd.read_csv(run.path / "results.csv").to_dict("records"))
+        tell_json(pd.read_csv(run.path / "results.csv").to_dict("records"), as_json=as_json, file=out)
+    if as_json:
         return
     print_results(run.path, quiet)
     say(quiet, f"{folder}: {n_scored} {told}, tables rewritten")
@@ -199,7 +224,12 @@ def report(
     ] = None,
     against: Annotated[
         str | None,
-        typer.Option(metavar="VARIANT", help="compare every method of the run with this one", show_default=False),
+        typer.Option(
+            metavar="VARIANT",
+            help="compare every method of the run with this one",
+            show_default=False,
+            autocompletion=complete_method,
+        ),
     ] = None,
     out: Annotated[
         Path | None,

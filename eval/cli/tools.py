@@ -3,14 +3,15 @@
 # ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from eval.cli.options import AsJson, Quiet
+from eval.cli.options import AsJson, JsonFile, Quiet, complete_any
 from eval.cli.printed_answer import LINE
-from eval.core.printing import MET, echo, echo_json, line_width, print_table
+from eval.core.printing import MET, echo, line_width, print_table, require_json_file, tell_json
 
 
 def bench(
@@ -49,24 +50,26 @@ def list_command(
         typer.Argument(help="this alone, with one-line descriptions; of settings with default and unit"),
     ] = None,
     as_json: AsJson = False,
+    out: JsonFile = None,
 ) -> None:
     """List scenarios, props, plans, presets, methods, metrics, sensors; or one of these, or the settings, described."""
     from dataclasses import asdict
 
     from eval.cli.listing import describe_entry, describe_setting, list_entries
 
+    require_json_file(out)
     if what is None:
         names = {title: [entry.name for entry in list_entries(kind)] for kind, title in _TITLES.items()}
+        tell_json({kind: names[title] for kind, title in _TITLES.items()}, as_json=as_json, file=out)
         if as_json:
-            echo_json({kind: names[title] for kind, title in _TITLES.items()})
             return
         for title, of_kind in names.items():
             echo(f"{title}:", *(f"  {name}" for name in of_kind))
         return
     columns = ["name", "default", "unit", "description"] if what == "settings" else ["name", "description"]
     entries = list_entries(what)
+    tell_json([{column: asdict(entry)[column] for column in columns} for entry in entries], as_json=as_json, file=out)
     if as_json:
-        echo_json([{column: asdict(entry)[column] for column in columns} for entry in entries])
         return
     for entry in entries:
         echo(*(describe_setting(entry, LINE) if what == "settings" else [describe_entry(entry, entries, line_width())]))
@@ -83,20 +86,20 @@ _TITLES = {
 }
 
 
-def doctor(as_json: AsJson = False) -> None:
+def doctor(as_json: AsJson = False, out: JsonFile = None) -> None:
     """Print what is installed, whether it works, and how to repair what does not."""
     from dataclasses import asdict
 
     from cdpipe.core.errors import InputError
     from eval.cli.doctor import examine, faults
 
+    require_json_file(out)
     found = []
     for each in examine():
         found.append(each)
         if not as_json:
             echo(f"{each.what:<15} {each.state:<7} {each.told}")
-    if as_json:
-        echo_json([asdict(each) for each in found])
+    tell_json([asdict(each) for each in found], as_json=as_json, file=out)
     if wrong := faults(found):
         raise InputError("\n".join(wrong))
     if not as_json:
@@ -104,12 +107,16 @@ def doctor(as_json: AsJson = False) -> None:
 
 
 def check(
-    files: Annotated[list[str], typer.Argument(help="scenario, plan or preset: a name or a .yaml file")],
+    files: Annotated[
+        list[str], typer.Argument(help="scenario, plan or preset: a name or a .yaml file", autocompletion=complete_any)
+    ],
     as_json: AsJson = False,
+    out: JsonFile = None,
 ) -> None:
     """Validate scenarios, plans and presets without running anything."""
     from cdpipe.core.errors import InputError
 
+    require_json_file(out)
     mistakes: list[str] = []
     rows: list[dict[str, object]] = []
     for file in files:
@@ -122,14 +129,13 @@ def check(
         rows.append({"file": file, "is": found or None, "mistakes": own})
         if found and not as_json:
             echo(f"{file}: {found}, no mistakes")
-    if as_json:
-        echo_json(rows)
+    tell_json(rows, as_json=as_json, file=out)
     if mistakes:
         raise InputError("\n".join(mistakes))
 
 
 def check_file(name_or_path: str) -> str:
-    """Check a scenario, plan or preset, and return its kind in words.
+    """Check a scenario, the meshes it names, a plan or a preset, and return its kind in words.
 
     A file is of the kind with which it shares most keys, so that one misspelt key does not change its kind.
 
@@ -164,6 +170,30 @@ def check_file(name_or_path: str) -> str:
         return f"a plan of {len(expand_cells(load_plan(name_or_path)))} cells"
     if kind == "scenario":
         check_scenario(name_or_path)
+        _open_meshes(name_or_path)
     else:
         load_config(name_or_path)
     return f"a {kind}"
+
+
+def _open_meshes(scenario: str) -> None:
+    """Read every mesh that a scenario names for one of the checked seeds, as `simulate` reads it.
+
+    Raises:
+        ScenarioError: Some cannot be used: one line each.
+    """
+    from cdpipe.core.errors import ScenarioError
+    from scenarios.library import CHECKED_SEEDS, load_scenario
+    from sim.rock.foreign import prop_mesh, tunnel_mesh
+
+    drawn = [load_scenario(scenario, seed) for seed in CHECKED_SEEDS]
+    tunnels = dict.fromkeys(each.tunnel.mesh for each in drawn if each.tunnel.mesh)
+    props = dict.fromkeys((prop.mesh, prop.name) for each in drawn for prop in each.props if prop.mesh)
+    mistakes = []
+    for read in [*(partial(tunnel_mesh, mesh) for mesh in tunnels), *(partial(prop_mesh, *prop) for prop in props)]:
+        try:
+            read()
+        except ScenarioError as error:
+            mistakes.append(f"{scenario}: {error}")
+    if mistakes:
+        raise ScenarioError("\n".join(mistakes))

@@ -6,46 +6,132 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from eval.cli.options import Families, Quiet, Scheduler, SetSettings, Workers
-from eval.core.printing import say, warn
+from eval.cli.options import (
+    OldWorldSettings,
+    Quiet,
+    Scheduler,
+    Workers,
+    WorldSettings,
+    complete_release,
+    complete_scenario,
+    join_world_settings,
+    world_mistakes,
+)
+from eval.core.printing import count_pairs, say, warn
 from eval.core.progress import shown_progress
+
+if TYPE_CHECKING:
+    from eval.core.cluster import Where
 
 
 def dataset(
-    families: Families,
+    families: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="FAMILY",
+            help="names from `list`, or .yaml files",
+            show_default=False,
+            autocompletion=complete_scenario,
+        ),
+    ] = None,
     seeds: Annotated[
-        str, typer.Option(metavar="A:B", help="B excluded; below 10000 to train, 10000 to 19999 to validate")
-    ],
-    out: Annotated[Path, typer.Option("--out", help="data folder: new, empty, or of an earlier run to continue")],
-    settings: SetSettings = None,
+        str | None,
+        typer.Option(metavar="A:B", help="B excluded; below 10000 to train, 10000 to 19999 to validate"),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="data folder: new, empty, or of an earlier run to continue; a release: or FILE.zip"),
+    ] = None,
+    world: WorldSettings = None,
+    settings: OldWorldSettings = None,
     draws: Annotated[int, typer.Option(min=1, help="after images of each keyframe; the first is merged exactly")] = 4,
     error_m: Annotated[float, typer.Option(min=0, help="merge error of the other draws: translation, 1 sigma")] = 0.03,
     error_deg: Annotated[float, typer.Option(min=0, help="rotation, 1 sigma per component")] = 0.2,
+    release: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="pack pairs of sessions to hand out instead: `lite`",
+            show_default=False,
+            autocompletion=complete_release,
+        ),
+    ] = None,
+    unpack: Annotated[
+        Path | None, typer.Option(metavar="FILE.zip", help="check and unpack a release instead", show_default=False)
+    ] = None,
+    with_truth: Annotated[bool, typer.Option("--with-truth", help="of --unpack: pairs with their truth")] = False,
     workers: Workers = None,
     scheduler: Scheduler = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="make at most this many tunnels")] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="make at most this many tunnels, or pairs")] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Make training data for descriptors, one shard per tunnel. Finished tunnels are kept."""
+    """Make training data for descriptors, one shard per tunnel; or a release of pairs. What is finished is kept."""
+    from cdpipe.core.errors import InputError
     from eval.core.cluster import Where, exposure, require_reachable, require_usable
     from eval.training.dataset import Recipe
     from eval.training.dataset_run import make_dataset
 
-    recipe, where = Recipe(draws, error_m, error_deg, tuple(settings or ())), Where(workers, scheduler)
+    where, asked = Where(workers, scheduler), join_world_settings(world, settings)
+    if out is None:
+        raise InputError("dataset: no place for the data: name it with --out")
+    if release is not None or unpack is not None:
+        what = f"--release {release}" if unpack is None else f"--unpack {unpack}"
+        if families or seeds or asked or (release and unpack):
+            raise InputError(f"{what}: has pairs and settings of its own: leave FAMILY, --seeds and --world out")
+        if with_truth and unpack is None:
+            raise InputError("--with-truth: a release holds the truth, apart from the sessions: leave it out")
+        _release_or_unpack(release, unpack, out, where, limit, quiet=quiet, with_truth=with_truth)
+        return
+    if not families or seeds is None or with_truth:
+        raise InputError(
+            "dataset: expected FAMILY... with --seeds A:B and --out DIR; --release NAME with --out FILE.zip; or "
+            "--unpack FILE.zip with --out DIR"
+        )
+    recipe = Recipe(draws, error_m, error_deg, tuple(asked))
     require_usable(where)
     require_reachable(where)
     warn(exposure(where))
-    with shown_progress(quiet, rate="tunnels") as progress:
+    with world_mistakes(), shown_progress(quiet, rate="tunnels") as progress:
         command = shlex.join(["tunnelcd", *sys.argv[1:]])
         outcome = make_dataset(families, seeds, recipe, out, where, limit, command, progress)
     left = f", {outcome.n_left} left by --limit" if outcome.n_left else ""
     refused = f", {outcome.n_refused} refused (README.md says why)" if outcome.n_refused else ""
     rate = f"; {outcome.n_pairs} keyframe pairs, {outcome.n_pairs / outcome.seconds:.1f}/s" if outcome.n_made else ""
     say(quiet, f"{out}: {outcome.n_made} tunnels made, {outcome.n_kept} kept from earlier{refused}{left}{rate}")
+
+
+def _release_or_unpack(
+    name: str | None,
+    file: Path | None,
+    out: Path,
+    where: Where,
+    limit: int | None,
+    *,
+    quiet: bool,
+    with_truth: bool,
+) -> None:
+    from eval.release.archive import digest_file, unpack_release
+    from eval.release.content import load_release
+    from eval.release.making import make_release
+
+    if file is not None:
+        with shown_progress(quiet) as progress:
+            n_pairs = unpack_release(file, out, with_truth=with_truth, progress=progress)
+        kind = "with truth" if with_truth else "without truth"
+        say(quiet, f"{out}: {count_pairs(n_pairs)} {kind}, all digests right")
+        return
+    with shown_progress(quiet, rate="pairs") as progress:
+        outcome = make_release(load_release(name or ""), out, where, limit, progress)
+    made = f"{count_pairs(outcome.n_made)} made, {outcome.n_kept} kept from earlier"
+    if outcome.n_left:
+        say(quiet, f"{out}: {made}, {outcome.n_left} left by --limit: the same command goes on from there")
+        return
+    digest = f", SHA-256 {digest_file(out)}" if out.is_file() else ""
+    say(quiet, f"{out}: {made}; {outcome.n_bytes / 1e6:.0f} MB{digest}")
 
 
 def train(

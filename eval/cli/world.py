@@ -23,7 +23,16 @@ from eval.cli.inputs import (
     open_sources,
     sampled_points,
 )
-from eval.cli.options import Families, OutFolder, Quiet, SetSettings
+from eval.cli.options import (
+    Families,
+    OldWorldSettings,
+    OutFolder,
+    Quiet,
+    WorldSettings,
+    complete_scenario,
+    join_world_settings,
+    world_mistakes,
+)
 from eval.core.printing import echo, print_table, say, shown_warnings, warn
 from eval.core.progress import RunProgress, shown_progress
 
@@ -34,13 +43,16 @@ if TYPE_CHECKING:
 
 
 def simulate(
-    scenario: Annotated[str, typer.Argument(help="name from `list`, or a .yaml file")],
+    scenario: Annotated[
+        str, typer.Argument(help="name from `list`, or a .yaml file", autocompletion=complete_scenario)
+    ],
     out: OutFolder,
     seed: Annotated[int, typer.Option(min=0, help="seed of every distribution and of all noise")] = 0,
     sessions: Annotated[
         int, typer.Option(min=2, max=12, help="3 to 12: a story, DIR/session-01 ..., of which `pair` takes any two")
     ] = 2,
-    settings: SetSettings = None,
+    world: WorldSettings = None,
+    settings: OldWorldSettings = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate one pair of sessions with truth: DIR/before, DIR/after, DIR/truth."""
@@ -49,7 +61,8 @@ def simulate(
     from sim.session.simulate import simulate_pair
     from sim.story import simulate_story
 
-    drawn = load_scenario(scenario, seed, settings or ())
+    with world_mistakes():
+        drawn = load_scenario(scenario, seed, join_world_settings(world, settings))
     with new_folder(out) as partial, shown_progress(quiet) as progress:
         if sessions == 2:
             simulate_pair(drawn, seed, partial, on_progress=progress.stage)
@@ -101,7 +114,8 @@ def view(
     what: Annotated[
         str,
         typer.Argument(
-            help="scenario (name or .yaml file), simulated pair, session or recording; of an answer: the before session"
+            help="scenario (name or .yaml file), pair, session or recording; of an answer: the before session",
+            autocompletion=complete_scenario,
         ),
     ],
     after: Annotated[Path | None, typer.Argument(help="the later session of an answer", show_default=False)] = None,
@@ -109,7 +123,8 @@ def view(
     seed: Annotated[
         int | None, typer.Option(min=0, help="seed of a scenario; 0 if left out", show_default=False)
     ] = None,
-    settings: SetSettings = None,
+    world: WorldSettings = None,
+    settings: OldWorldSettings = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="port of the server; 0 takes a free one")] = 8080,
     host: Annotated[
         str, typer.Option(help="address of the server; 0.0.0.0 admits other machines, with a warning")
@@ -130,12 +145,13 @@ def view(
 
     if html is not None and not html.absolute().parent.is_dir():
         raise InputError(f"--html {html}: there is no folder {html.parent}: make it, or name another one")
+    asked = join_world_settings(world, settings)
     hows = how_to_read(1 if after is None else 2, form, topics, trajectory, odometry, metadata, deskew=deskew)
     with _sessions_at_hand([Path(what), *([] if after is None else [after])], quiet):
         if after is not None:
-            _view_answer(_require_answer(what, after, answer, seed, settings), hows, port, host, html, quiet)
+            _view_answer(_require_answer(what, after, answer, seed, asked), hows, port, host, html, quiet)
         else:
-            _view_one(what, seed, settings or (), hows[0], port, host, html, quiet)
+            _view_one(what, seed, asked, hows[0], port, host, html, quiet)
 
 
 @contextmanager
@@ -193,7 +209,7 @@ def _require_answer(
             "one; then view both sessions and ANSWER; or view one session alone"
         )
     if seed is not None or settings:
-        raise InputError(f"{before}: a session holds what was recorded: leave --seed and --set out")
+        raise InputError(f"{before}: a session holds what was recorded: leave --seed and --world out")
     return Path(before), after, answer
 
 
@@ -253,7 +269,7 @@ def _serve(load: Callable[[], View], what: str, port: int, host: str, quiet: boo
 
 
 def _load_with_progress(what: str, seed: int | None, settings: Sequence[str], how: HowToRead, *, quiet: bool) -> View:
-    with shown_warnings(), shown_progress(quiet) as progress:
+    with world_mistakes(), shown_warnings(), shown_progress(quiet) as progress:
         return load_view(what, seed, settings, how, progress)
 
 
@@ -290,7 +306,7 @@ def load_view(
     is_named = path.is_dir() or (path.exists() and path.suffix not in SUFFIXES)
     if is_pair(path) or is_session(path) or (is_named and what not in names):
         if seed is not None or settings:
-            raise InputError(f"{what}: a folder holds what was recorded: leave --seed and --set out")
+            raise InputError(f"{what}: a folder holds what was recorded: leave --seed and --world out")
         how = how or HowToRead()
         if is_pair(path) or is_session(path) or (path.is_dir() and not holds_scans(path)):
             return view_folder(path)

@@ -63,6 +63,34 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
+def new_files(*paths: Path) -> Iterator[Path]:
+    """Yield a hidden empty folder whose files of these names become `paths` when the block succeeds.
+
+    The folder is removed. When the block fails, nothing else is left either.
+
+    Raises:
+        InputError: A path exists, or they cannot be made. They lie in one folder.
+    """
+    for path in paths:
+        if path.exists() or path.is_symlink():
+            raise InputError(f"{path} exists already: name a new file or remove it")
+    first = paths[0].absolute()
+    partial = first.with_name(f".{first.name}.partial")
+    with made_parents(first):
+        try:
+            shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir()
+        except OSError as error:
+            raise unwritable(first, error) from error
+        try:
+            yield partial
+            for path in paths:
+                (partial / path.name).replace(path)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+
+@contextmanager
 def made_parents(path: Path) -> Iterator[None]:
     """Make the folders above `path`; when the block fails, remove those that are empty.
 

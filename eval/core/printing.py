@@ -15,12 +15,14 @@ import textwrap
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from cdpipe.core.errors import InputWarning
+from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.names import visible
+from eval.core.output import make_writable, unwritable, whole_file
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -67,7 +69,42 @@ def line_width() -> int:
 
 def echo_json(value: Any) -> None:
     """Print a value as JSON for programs; what is undefined is null."""
-    typer.echo(json.dumps(_plain(value), indent=1, allow_nan=False))
+    typer.echo(_as_json(value))
+
+
+def tell_json(value: Any, *, as_json: bool, file: Path | None) -> None:
+    """Print a value as JSON if asked to, and write it to a file if one is named.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    if as_json:
+        echo_json(value)
+    if file is not None:
+        try:
+            with whole_file(file) as partial:
+                partial.write_text(f"{_as_json(value)}\n", encoding="utf-8")
+        except OSError as error:
+            raise unwritable(file, error) from error
+
+
+def require_json_file(file: Path | None) -> None:
+    """Check before the work that a file can be written, if one is named.
+
+    Raises:
+        InputError: It is a folder, or its folder is missing or cannot be written.
+    """
+    if file is None:
+        return
+    if file.is_dir():
+        raise InputError(f"--out {file}: is a folder: name a file")
+    if not file.absolute().parent.is_dir():
+        raise InputError(f"--out {file}: there is no folder {file.parent}: make it, or name another one")
+    make_writable(file.absolute().parent)
+
+
+def _as_json(value: Any) -> str:
+    return json.dumps(_plain(value), indent=1, allow_nan=False)
 
 
 def _plain(value: Any) -> Any:

@@ -34,7 +34,7 @@ def plot(report: ChangeReport, pair: Path | str | None = None) -> Figure:
     figure = Figure(figsize=(8, 6), layout="constrained")
     axes = figure.add_subplot(aspect="equal", xlabel="x of the map frame [m]", ylabel="y of the map frame [m]")
     if pair is not None:
-        truth = load_ground_truth(Path(pair))
+        truth = load_ground_truth(Path(pair), keeps_points=False)
         path_m = truth.before.odom_T_sensor[truth.before.judged_scans, :2, 3]
         axes.plot(*path_m.T, color="0.7", label="path of the before session")
         changes = truth.centroids_world[truth.is_observable].reshape(-1, 3)

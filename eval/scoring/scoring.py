@@ -72,12 +72,12 @@ class CaseScore:
 def score(answer: ChangeReport | Path | str, pair: Path | str) -> dict[str, Any]:
     """Score a report, or the folder of a stored answer, against a simulated pair: one row of results.csv.
 
-    A report is called as its config says under `method`, or else by its source of regions.
+    A report is called as its config says under `method`, or else by its source of regions. The pair is not written to.
 
     Raises:
         InputError: The pair has no truth, a file is damaged, or the answer cannot be an answer to this pair.
     """
-    truth = load_ground_truth(Path(pair))
+    truth = load_ground_truth(Path(pair), keeps_points=False)
     if not isinstance(answer, ChangeReport):
         return score_stored(truth, Path(answer)).row
     config: dict[str, Any] = dict(answer.config)

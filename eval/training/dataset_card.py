@@ -1,6 +1,7 @@
-"""Index and data card of a folder of shards: index.csv, one row per tunnel, and README.md.
+"""Index, data card, digests and metadata of a folder of shards: index.csv, README.md, SHA256SUMS, croissant.json.
 
-Both are made from the shards in the folder, so that they are right after an interrupted run as well.
+index.csv has one row per tunnel. All are made from the shards in the folder, so that they are right after an
+interrupted run as well.
 """
 
 from __future__ import annotations
@@ -17,17 +18,33 @@ from cdpipe.core.files import read_json
 from cdpipe.core.names import visible
 from cdpipe.training.shard import FIELDS, SUFFIX, read_about, split_of
 from eval.core.output import whole_file
+from eval.plans.splits import version_name
+from eval.release.archive import digest_file, write_sums_of
+from eval.release.croissant import FILE, Column, FileGroup, Table, describe_croissant, write_croissant
 
 COUNTS = ("n_before", "n_after", "n_covered", "n_positive", "n_negative", "n_changes", "n_observable")
 INDEX_COLUMNS = (
     "family", "seed", "split", "status", "shard", *COUNTS, "score_radius_m", "bytes", "sha256", "digest", "reason",
 )  # fmt: skip
+_DESCRIPTION = "Simulated tunnels, each driven twice by a ray-cast LiDAR, as training data of change descriptors"
+_ENCODING = "application/octet-stream"
+_TYPES = {**dict.fromkeys((*COUNTS, "seed", "bytes"), "whole"), "score_radius_m": "number"}
+_MEANINGS = {
+    "family": "scenario family", "seed": "seed that drew the tunnel", "split": "train, validation or test, by the seed",
+    "status": "ok, or refused: the tunnel cannot be built", "shard": "file of the shard, empty where refused",
+    "n_before": "before keyframes", "n_after": "after keyframes", "n_covered": "with an after keyframe within 5 m",
+    "n_positive": "near an observable change", "n_negative": "far from every change", "n_changes": "changed objects",
+    "n_observable": "changes that both sessions could see", "bytes": "size of the shard",
+    "score_radius_m": "distance within which a region finds a change, metres", "sha256": "digest of the shard",
+    "digest": "digest of what the shard is made of", "reason": "why there is no shard",
+}  # fmt: skip
+_COLUMNS = tuple(Column(name, _TYPES.get(name, "text"), _MEANINGS[name]) for name in INDEX_COLUMNS)
 _REMEDY = "remove it and run the command again"
 Row = dict[str, Any]
 
 
 def write_card(out: Path) -> None:
-    """Write index.csv and README.md of a folder.
+    """Write index.csv, README.md, croissant.json and SHA256SUMS of a folder.
 
     Raises:
         InputError: A shard is damaged.
@@ -40,6 +57,13 @@ def write_card(out: Path) -> None:
     document = read_json(out / "dataset.json", "expected a folder made by `tunnelcd dataset`")
     with whole_file(out / "README.md") as partial:
         partial.write_text(card(rows, document["recipe"], document["commands"]), encoding="utf-8")
+    table = Table("index.csv", digest_file(out / "index.csv"), "One row is one tunnel.", _COLUMNS)
+    shards = FileGroup("shards", "the arrays of one tunnel each, as README.md lists them", _ENCODING, f"*{SUFFIX}")
+    version = version_name().removeprefix("tunnelcd ")
+    write_croissant(out, describe_croissant("tunnelcd-training", _DESCRIPTION, version, (shards,), table))
+    digests = {row["shard"]: row["sha256"] for row in rows if row["status"] == "ok"}
+    digests |= {name: digest_file(out / name) for name in ("README.md", "dataset.json", "index.csv", FILE)}
+    write_sums_of(out, [f"{digest}  {name}\n" for name, digest in sorted(digests.items())])
 
 
 def fields_table() -> str:
@@ -84,6 +108,7 @@ score radius of an observable change, negative beyond 1.5 radii of every change,
 | that error, standard deviation of each component | {recipe["error_m"]:g} m and {recipe["error_deg"]:g} deg |
 | digest of all shards | `{digest_of(made)}` |
 | bytes | {sum(row["bytes"] for row in made):,} |
+| version | {version_name()} |
 | licence | MIT, as tunnelcd itself: everything is simulated, nothing was recorded |
 
 ## Tunnels that could not be built

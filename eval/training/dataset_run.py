@@ -172,7 +172,7 @@ def _told(recipe: Any) -> str:
     """Return a recipe as options of the command."""
     try:
         options = f"--draws {recipe['draws']} --error-m {recipe['error_m']:g} --error-deg {recipe['error_deg']:g}"
-        return " ".join([options, *(f"--set {setting}" for setting in recipe["settings"])])
+        return " ".join([options, *(f"--world {setting}" for setting in recipe["settings"])])
     except (KeyError, TypeError, ValueError):
         return "something else"
 

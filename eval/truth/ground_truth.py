@@ -134,15 +134,20 @@ class GroundTruth:
         return int(np.count_nonzero(self.is_observable))
 
 
-def load_ground_truth(pair: Path) -> GroundTruth:
+def load_ground_truth(pair: Path, *, keeps_points: bool = True) -> GroundTruth:
     """Read the truth of a simulated pair.
+
+    Args:
+        pair: Its folder.
+        keeps_points: Whether the scoring points may be stored in the pair, so that they are read the next time; where
+            not, nothing is written.
 
     Raises:
         InputError: A session or a part of the truth is missing, damaged or of another session.
     """
     truth = read_pair_truth(pair)
     n_movers = {name: sum(mover.session == name for mover in truth.movers) for name in SESSIONS}
-    return ground_truth(truth, {name: _load_session(pair / name, n_movers[name]) for name in SESSIONS})
+    return ground_truth(truth, {name: _load_session(pair / name, n_movers[name], keeps_points) for name in SESSIONS})
 
 
 def ground_truth(truth: PairTruth, sessions: Mapping[SessionName, SessionTruth]) -> GroundTruth:
@@ -170,12 +175,12 @@ def ground_truth(truth: PairTruth, sessions: Mapping[SessionName, SessionTruth])
     )
 
 
-def _load_session(path: Path, n_movers: int) -> SessionTruth:
+def _load_session(path: Path, n_movers: int, keeps_points: bool) -> SessionTruth:
     session = read_session(path)
     odom_T_sensor, made_poses = session.odom_T_sensor, str(session.provenance.get("odometry", ""))
     seen_world = _load_seen_movers(path, n_movers, len(odom_T_sensor))
     try:
-        points = load_scoring_points(path)
+        points = load_scoring_points(path, keeps=keeps_points)
         poses, surface = read_true_poses(path), _load_surface(session, points)
         return SessionTruth(odom_T_sensor, poses, points, seen_world, made_poses=made_poses, surface=surface)
     except (KeyError, ValueError) as error:

@@ -99,8 +99,12 @@ class ScoringPoints:
         return np.unique(place[self.returns[place] == wanted])
 
 
-def load_scoring_points(session: Path) -> ScoringPoints:
-    """Return the scoring points of a simulated session: from `truth/scoring_points.npz`, or built and stored there.
+def load_scoring_points(session: Path, *, keeps: bool = True) -> ScoringPoints:
+    """Return the scoring points of a simulated session: from `truth/scoring_points.npz`, or built.
+
+    Args:
+        session: The session.
+        keeps: Whether they are stored there when they are built.
 
     Raises:
         InputError: The session or its truth is missing or damaged.
@@ -112,7 +116,7 @@ def load_scoring_points(session: Path) -> ScoringPoints:
     if cached is not None:
         return cached
     scoring_points = build_scoring_points(opened)
-    if not session.is_symlink() and not path.parent.is_symlink():  # else the file would lie in another pair
+    if keeps and not session.is_symlink() and not path.parent.is_symlink():  # else the file would lie in another pair
         _write_cache(path, fingerprint, scoring_points)
     return scoring_points
 

@@ -1,3 +1,4 @@
+from .glb import write_glb
 from .view import View, is_pair, view_folder, view_scenario
 from .viewer import running_server, write_html
 
@@ -7,5 +8,6 @@ __all__ = [
     "running_server",
     "view_folder",
     "view_scenario",
+    "write_glb",
     "write_html",
 ]

@@ -22,7 +22,7 @@ from tests.soak.disturbers import Disturber, OneMachine, OwnCluster
 from tests.trust.contents import find_damaged
 
 _SMALL = ("sensor.mode=512x10", "platform.scan_spacing_m=1.0")  # a quarter of the returns
-_SET = " ".join(f"--set {setting}" for setting in _SMALL)
+_WORLD = " ".join(f"--world {setting}" for setting in _SMALL)
 _MOST_STARTS = 40  # of one run or command; then it counts as one that never ends
 
 
@@ -98,12 +98,12 @@ class Written:
 
 
 COMMANDS: Mapping[str, Written] = {
-    "simulate": Written(f"simulate smoke/one_box --seed 20000 {_SET} --out pair", "pair", is_once=True),
+    "simulate": Written(f"simulate smoke/one_box --seed 20000 {_WORLD} --out pair", "pair", is_once=True),
     "detect": Written("detect pair/before pair/after --out answer", "answer", {"pair": "simulate/pair"}, is_once=True),
     "describe": Written("describe pair/before", "pair", {"pair": "simulate/pair"}),
     "convert to OSF": Written("convert pair/before osf/a.osf", "osf", {"pair": "simulate/pair"}),
     "convert from OSF": Written("convert osf/a.osf session", "session", {"osf": "convert to OSF/osf"}, is_once=True),
-    "dataset": Written(f"dataset smoke/one_box --seeds 9998:10002 --draws 1 {_SET} --out data", "data"),
+    "dataset": Written(f"dataset smoke/one_box --seeds 9998:10002 --draws 1 {_WORLD} --out data", "data"),
     # two validations, and so a state to go on from
     "train sphere": Written("train data --steps 300 --threads 1 --out weights", "weights", {"data": "dataset/data"}),
     "train 3deg": Written(

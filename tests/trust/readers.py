@@ -43,6 +43,7 @@ from cdpipe.training.sphere_training import read_sphere_data
 from eval.leaderboard.page import write_leaderboard
 from eval.leaderboard.submission import pack_submission, read_submission
 from eval.plans.plan import expand_cells, load_plan
+from eval.release.archive import pack, unpack_release, write_sums
 from eval.report.comparison import compare_sides
 from eval.report.page import write_page
 from eval.running.cell_file import LAST, NO_KEY, cell_document
@@ -462,6 +463,20 @@ def _read_submission(folder: Path) -> None:
     write_leaderboard([read_submission(folder / "again.zip")], folder / "board.html", None, [0])
 
 
+def _release(folder: Path) -> None:
+    for name in ("sessions/0123456789abcdef/before/a.npz", "truth/0123456789abcdef/truth/changes.json", "README.md"):
+        (folder / "unpacked" / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / "unpacked" / name).write_text(name * 20)
+    write_sums(folder / "unpacked")
+    pack(folder / "unpacked", folder / "r.zip")
+
+
+def _read_release(folder: Path) -> None:
+    unpack_release(folder / "r.zip", folder / "pairs", with_truth=True)
+    pack(folder / "unpacked", folder / "again.zip")
+    unpack_release(folder / "again.zip", folder / "more")
+
+
 def _osf(folder: Path) -> None:
     from tests.cdpipe import recordings  # noqa: PLC0415 - only where the vendor's SDK is installed
 
@@ -585,6 +600,7 @@ READERS: tuple[Reader, ...] = (
     Reader("answer, scored", _scored, _read_scored, ("answer/*",), 1.5, lines=True),
     Reader("known merge", _merges, _read_merges, ("*",), 0.7, lines=True),
     Reader("submission", _submission, _read_submission, ("mine.zip", "unpacked/submission.json"), 0.05, lines=True),
+    Reader("release", _release, _read_release, ("r.zip", "unpacked/SHA256SUMS"), 0.4, lines=True),
     Reader("preset", _copy(*_PRESETS), _read_presets, ("*.yaml",), 2.0, lines=True),
     Reader("plan", _copy(*_PLANS), _read_plans, ("*.yaml",), 0.3, lines=True),
     Reader("scenario", _copy(*_FAMILIES), _read_families, ("*.yaml",), 0.4, lines=True),

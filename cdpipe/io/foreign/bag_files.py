@@ -10,16 +10,17 @@ from __future__ import annotations
 import json
 import tempfile
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.isolated_reader import Message
-from cdpipe.io.foreign.clouds import TIME_FIELDS
+from cdpipe.io.foreign.clouds import INTENSITY_FIELDS, TIME_FIELDS, field_of
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -120,6 +121,9 @@ def _cloud(message: Any) -> dict[str, Any]:
     time = next((name for name in table.dtype.names or () if name.lower() in TIME_FIELDS), None)
     if time is not None and table[time].ndim == 1:
         arrays["times"] = np.ascontiguousarray(table[time].astype(table[time].dtype.newbyteorder("=")))
+    shone = field_of(table.dtype.names or (), INTENSITY_FIELDS)
+    if shone is not None and table[shone].ndim == 1:
+        arrays["intensity"] = np.ascontiguousarray(table[shone].astype(table[shone].dtype.newbyteorder("=")))
     return arrays
 
 
@@ -172,6 +176,7 @@ def _bag(path: str) -> Iterator[Any]:
         raise InputError(f"{path}: not a readable bag: {told[:300]}") from error
 
 
+_MCAP, _SQLITE = b"\x89MCAP", b"SQLite format 3"
 _LIBRARIES = ("rosbags", "sqlite3", "zstandard", "lz4", "ruamel", "struct")
 
 
@@ -188,8 +193,13 @@ def _as_bag(path: Path, folder: Path) -> Path:
         head = file.read(16)
     if head.startswith(b"#ROSBAG"):
         return path
+    if not head.startswith((_MCAP, _SQLITE)):
+        raise ValueError(
+            f"it begins with none of {b'#ROSBAG'!r}, {_MCAP!r} and {_SQLITE!r}: cut short or no bag: copy or record it "
+            "again"
+        )
     (folder / path.name).symlink_to(path.absolute())
-    is_mcap = head.startswith(b"\x89MCAP")
+    is_mcap = head.startswith(_MCAP)
     topics = _topics_of_mcap(path) if is_mcap else _topics_of_sqlite(path)
     about = {
         "version": 5,
@@ -210,6 +220,14 @@ def _as_bag(path: Path, folder: Path) -> Path:
     return folder
 
 
+class _Channel(NamedTuple):
+    """What rosbags asks of a connection, and the number of the channel."""
+
+    topic: str
+    msgtype: str
+    key: int
+
+
 def _topics_of_mcap(path: Path) -> list[tuple[str, str, str, int]]:
     from rosbags.rosbag2.storage_mcap import MCAPFile
 
@@ -218,10 +236,12 @@ def _topics_of_mcap(path: Path) -> list[tuple[str, str, str, int]]:
     try:
         if not file.channels:
             file.meta_scan()
-        counts: dict[int, int] = {}
+        counts: Counter[int] = Counter()
         for chunk in file.chunks:
-            for key, count in chunk.channel_count.items():
-                counts[key] = counts.get(key, 0) + count
+            counts.update(chunk.channel_count)
+        if not file.chunks:  # nor an index: every message is looked at
+            asked = [_Channel(each.topic, each.schema, key) for key, each in file.channels.items()]
+            counts.update(each.key for each, *_ in file.messages_scan(asked))
         return [(it.topic, it.schema, it.message_encoding, counts.get(it.id, 0)) for it in file.channels.values()]
     finally:
         file.close()

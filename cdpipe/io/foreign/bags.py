@@ -24,6 +24,7 @@ from cdpipe.io.tum import require_unit_poses
 _FIXED = ("odom", "map", "world")
 _LONGEST_CHAIN = 64
 _LISTED = 8
+_MOST_WAITING = 64  # clouds in memory while they are sorted: 200 MB of 130,000 points each
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,12 +71,9 @@ class BagScans:
         stamps: Int64Array = arrays["stamps"]
         if not len(stamps):
             raise InputError(f"{path}: {self._topic}: no cloud can be read from it")
-        self._is_kept = self._find_returns(arrays["has_returns"] > 0)
-        stamps, numbers = stamps[self._is_kept], np.flatnonzero(self._is_kept)
-        late = 1 + next(iter(np.flatnonzero(np.diff(stamps) <= 0).tolist()), -1)
-        if late:
-            told = f"the stamp of cloud {numbers[late]} does not come after that of the one before"
-            raise InputError(f"{path}: {self._topic}: {told}")
+        # cloud of the topic that each scan is, scans in the order of their stamps
+        self._numbers = self._sort(np.flatnonzero(self._find_returns(arrays["has_returns"] > 0)), stamps)
+        stamps = stamps[self._numbers]
         self.stamps_s: Float64Array | None = stamps / 1e9
         self.lacks = f"no poses of the sensor in it (it holds {self._listed()})"
         if not is_posed:
@@ -85,11 +83,11 @@ class BagScans:
 
     def __len__(self) -> int:
         """Return the number of scans."""
-        return int(np.count_nonzero(self._is_kept))
+        return len(self._numbers)
 
     def where(self, index: int) -> str:
         """Name a scan."""
-        return f"{self._path}: {self._topic}: cloud {int(np.flatnonzero(self._is_kept)[index])}"
+        return f"{self._path}: {self._topic}: cloud {int(self._numbers[index])}"
 
     def read(self, index: int) -> Cloud:
         """Read one scan, and all before it."""
@@ -98,11 +96,43 @@ class BagScans:
     def read_all(self) -> Iterator[Cloud]:
         """Read all scans in order; points that are not finite are missing returns."""
         messages = self._reader.read("read_clouds", path=self.name, topic=self._topic)
+        places = {number: place for place, number in enumerate(self._numbers.tolist())}
+        waiting: dict[int, Cloud] = {}
+        done = 0
         for number, (_, arrays) in enumerate(messages):
-            if number < len(self._is_kept) and self._is_kept[number]:
-                cloud = check_cloud(f"{self._path}: {self._topic}: cloud {number}", arrays)
-                cloud.points[np.flatnonzero(~np.isfinite(cloud.points).all(axis=1))] = 0.0
-                yield cloud
+            if number not in places:
+                continue
+            cloud = check_cloud(f"{self._path}: {self._topic}: cloud {number}", arrays)
+            cloud.points[np.flatnonzero(~np.isfinite(cloud.points).all(axis=1))] = 0.0
+            waiting[places[number]] = cloud
+            while done in waiting:
+                yield waiting.pop(done)
+                done += 1
+
+    def _sort(self, numbers: Int64Array, stamps: Int64Array) -> Int64Array:
+        """Return the clouds (S,) in the order of their stamps, each stamp once."""
+        unique, first = np.unique(stamps[numbers], return_index=True)
+        n_repeats, where = len(numbers) - len(unique), f"{self._path}: {self._topic}"
+        if n_repeats > len(unique):
+            raise InputError(
+                f"{where}: too few stamps ({len(unique)} on {len(numbers)} clouds): header.stamp was not set: "
+                "set it and record again, or rewrite the stamps"
+            )
+        if n_repeats:
+            told = f"{n_repeats} of {len(numbers)} clouds have the stamp of another one, and are left out"
+            warnings.warn(f"{where}: {told}", InputWarning, stacklevel=2)
+        places = np.argsort(np.argsort(first))
+        n_waiting = int((np.maximum.accumulate(places) - np.arange(len(places))).max(initial=0))
+        if n_waiting > _MOST_WAITING:
+            raise InputError(
+                f"{where}: its clouds are up to {n_waiting} places out of the order of their stamps, at most "
+                f"{_MOST_WAITING} can be sorted: write the bag again in the order of header.stamp"
+            )
+        n_late = int(np.count_nonzero(np.diff(first) < 0))
+        if n_late:
+            told = f"{n_late} clouds come after one with a later stamp, and are sorted by header.stamp"
+            warnings.warn(f"{where}: {told}", InputWarning, stacklevel=2)
+        return numbers[first]
 
     def _choose(self, kind: str, topics: Sequence[str], what: str) -> str:
         found = [name for name, its_kind, _ in self._topics if its_kind == kind]
@@ -143,7 +173,7 @@ class BagScans:
         if n_out:
             told = f"{n_out} of {len(stamps_s)} clouds lie before or after its poses, and are left out"
             warnings.warn(f"{self._path}: {told}", InputWarning, stacklevel=2)
-        self._is_kept[np.flatnonzero(self._is_kept)] = is_inside
+        self._numbers = self._numbers[is_inside]
         self.stamps_s = stamps_s[is_inside]
 
     def _find_poses(self, topics: Sequence[str]) -> Trajectory | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -12,13 +12,15 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import Float32Array, Float64Array
 from cdpipe.io.foreign.trajectory import Trajectory
 
 # Longest and shortest sweep of a scan, which tell the unit of the times of its points.
 _SWEEP_S = (0.004, 1.5)
 TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "timeoffset", "point_time", "gps_time")
 """Names, in lower case, under which formats keep the time of each point."""
+INTENSITY_FIELDS = ("intensity", "reflectivity", "remission", "scalar_intensity", "i")
+"""Names, in lower case, under which formats keep how strongly each point shone, the usual one first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,10 +30,12 @@ class Cloud:
     Attributes:
         points: (N, 3) float64 points in the sensor frame, metres; a missing return is NaN or (0, 0, 0).
         times: (N,) time of each point in any unit and from any start, None where the format has none.
+        intensity: (N,) intensity of each point in the format's own unit, None where the format has none.
     """
 
     points: Float64Array
     times: npt.NDArray[np.number] | None = None
+    intensity: Float32Array | None = None
 
 
 class Clouds(Protocol):
@@ -99,7 +103,7 @@ class CloudFiles:
 
 
 def check_cloud(where: str, arrays: dict[str, npt.NDArray[Any]]) -> Cloud:
-    """Return the cloud of what a reader in another process sent: `points` and perhaps `times`.
+    """Return the cloud of what a reader in another process sent: `points` and perhaps `times` and `intensity`.
 
     Raises:
         InputError: An array has another shape or kind.
@@ -109,8 +113,18 @@ def check_cloud(where: str, arrays: dict[str, npt.NDArray[Any]]) -> Cloud:
         raise InputError(f"{where}: holds no x, y and z")
     if times is not None and times.shape != (len(points),):
         raise InputError(f"{where}: {len(times)} times for {len(points)} points")
-    with np.errstate(invalid="ignore"):  # a NaN that signals
-        return Cloud(points.astype(np.float64), times)
+    intensity = arrays.get("intensity")
+    if intensity is not None and (intensity.shape != (len(points),) or intensity.dtype.kind not in "fiu"):
+        raise InputError(f"{where}: {len(intensity)} intensities for {len(points)} points")
+    with np.errstate(invalid="ignore", over="ignore"):  # a NaN that signals
+        shone = None if intensity is None else intensity.astype(np.float32)
+        return Cloud(points.astype(np.float64), times, shone)
+
+
+def field_of(names: Iterable[str], usual: Sequence[str]) -> str | None:
+    """Return the name that comes first among the usual ones, in lower case; None if there is none."""
+    found = {name.lower(): name for name in names}
+    return next((found[name] for name in usual if name in found), None)
 
 
 def point_times(times: npt.NDArray[np.number] | None, stamp_s: float) -> Float64Array | None:

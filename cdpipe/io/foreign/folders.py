@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.errors import InputError
+from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.files import read_bytes
 from cdpipe.core.geometry import Float64Array, invert, make_pose
 from cdpipe.core.isolated_reader import IsolatedReader
@@ -80,6 +81,12 @@ def _find_poses(folder: Path, scans: Path, name: str) -> Trajectory | None:
         camera_T_sensor = read_calibration(folder / _CALIBRATION)
         poses = invert(camera_T_sensor) @ trajectory.poses @ camera_T_sensor
         trajectory = Trajectory(trajectory.where, poses, trajectory.time_s)
+    elif name == "kitti" and trajectory.time_s is None:
+        told = (
+            f"no {_CALIBRATION} beside it: its poses are taken for those of the lidar. KITTI's are of the camera: then"
+        )
+        usual = "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0"
+        warnings.warn(f"{found[0]}: {told} add {_CALIBRATION} with its line `{usual}`", InputWarning, stacklevel=2)
     return trajectory
 
 

@@ -10,8 +10,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
@@ -26,6 +28,7 @@ from cdpipe.io.ply import write_ply_points
 from cdpipe.io.tum import write_tum
 from cdpipe.mapping.odometry import estimate_cloud_motion
 from cdpipe.mapping.pose_check import check_quaternion_order
+from cdpipe.model.types import PosedScan
 
 KISS_ICP = "kiss-icp"
 # Called with the stage, the number of finished scans, and their (estimated) total.
@@ -78,7 +81,7 @@ class _Posed(PosedClouds):
         self, clouds: Clouds, poses: Float64Array, stamps_s: Float64Array, motion: Motion | None, poses_from: str
     ) -> None:
         super().__init__(clouds, poses, stamps_s, motion)
-        self.clouds, self.stamps_s, self.poses_from = clouds, stamps_s, poses_from
+        self.clouds, self.poses_from = clouds, poses_from
 
 
 def open_recording(path: Path, how: HowToRead, report: Progress) -> PosedClouds:
@@ -128,11 +131,18 @@ def write_scans(source: _Posed, out: Path, report: Progress) -> None:
     try:
         out.mkdir(exist_ok=True)
         for scan in source.scans():
-            write_ply_points(out / f"{scan.index:06d}.ply", scan.points_sensor)
+            write_ply_points(out / f"{scan.index:06d}.ply", scan.points_sensor, _scalars(scan))
             report("write", scan.index + 1, n_scans)
         write_tum(out / "trajectory.tum", source.stamps_s, source.odom_T_sensor)
     except OSError as error:
         raise InputError(f"{error.filename or out}: cannot be written: {error.strerror}") from error
+
+
+def _scalars(scan: PosedScan) -> dict[str, npt.NDArray[Any]]:
+    """Return what a PLY scan keeps beside its points: intensity, and seconds after the first point, where known."""
+    found: dict[str, npt.NDArray[Any]] = {} if scan.intensity is None else {"intensity": scan.intensity}
+    since_ns = scan.stamps_ns - scan.stamps_ns.min()
+    return found | ({"time": since_ns / 1e9} if since_ns.any() else {})
 
 
 @contextmanager

@@ -15,8 +15,8 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_bytes
 from cdpipe.core.isolated_reader import IsolatedReader, Message
 from cdpipe.core.plugins import require_extra
-from cdpipe.io.foreign.clouds import TIME_FIELDS, Cloud, check_cloud
-from cdpipe.io.ply import read_ply_points
+from cdpipe.io.foreign.clouds import INTENSITY_FIELDS, TIME_FIELDS, Cloud, check_cloud, field_of
+from cdpipe.io.ply import read_ply
 
 _HERE = __name__
 _LIBRARIES = {"pcd": "pypcd4", "las": "laspy", "e57": "pye57"}
@@ -36,7 +36,7 @@ def cloud_reader(name: str, folder: Path) -> Callable[[Path], Cloud]:
         InputError: The extra is not installed.
     """
     if name == "ply":
-        return lambda path: Cloud(read_ply_points(path))
+        return read_ply_cloud
     if name == "kitti":
         return read_bin
     require_extra("formats", str(folder))
@@ -48,6 +48,17 @@ def cloud_reader(name: str, folder: Path) -> Callable[[Path], Cloud]:
         return check_cloud(str(path), joined)
 
     return read
+
+
+def read_ply_cloud(path: Path) -> Cloud:
+    """Read the points of a PLY file, with their intensity where it has one; they are taken as deskewed.
+
+    Raises:
+        InputError: As `cdpipe.io.ply.read_ply`.
+    """
+    points, scalars = read_ply(path, INTENSITY_FIELDS)
+    shone = field_of(scalars, INTENSITY_FIELDS)
+    return check_cloud(str(path), {"points": points} | ({} if shone is None else {"intensity": scalars[shone]}))
 
 
 def read_bin(path: Path) -> Cloud:
@@ -63,7 +74,8 @@ def read_bin(path: Path) -> Cloud:
             "another layout"
         )
     with np.errstate(invalid="ignore"):
-        return Cloud(np.frombuffer(content, _KITTI).reshape(-1, 4)[:, :3].astype(np.float64))
+        rows = np.frombuffer(content, _KITTI).reshape(-1, 4)
+        return Cloud(rows[:, :3].astype(np.float64), intensity=rows[:, 3].astype(np.float32))
 
 
 def read_viewpoints(folder: Path, files: list[Path]) -> np.ndarray[Any, Any]:
@@ -94,7 +106,9 @@ def read_pcd(path: str) -> Iterator[Message]:
             raise ValueError(f"its fields are {', '.join(names)[:80]}: expected x, y and z")
         arrays = {"points": np.column_stack([data[axis] for axis in "xyz"])}
         time = next((name for name in names if name.lower() in TIME_FIELDS and data[name].ndim == 1), None)
-    yield {}, arrays | ({} if time is None else {"times": np.ascontiguousarray(data[time])})
+        shone = field_of((name for name in names if data[name].ndim == 1), INTENSITY_FIELDS)
+    more = {"times": time, "intensity": shone}
+    yield {}, arrays | {key: np.ascontiguousarray(data[name]) for key, name in more.items() if name is not None}
 
 
 def read_pcd_heads(paths: list[str]) -> Iterator[Message]:
@@ -120,6 +134,7 @@ def read_las(path: str) -> Iterator[Message]:
             arrays = {"points": np.column_stack([np.asarray(block[axis], np.float64) for axis in "xyz"])}
             if "gps_time" in block.point_format.dimension_names:
                 arrays["times"] = np.ascontiguousarray(block["gps_time"])
+            arrays["intensity"] = np.ascontiguousarray(block["intensity"])
             yield {}, arrays
         if n_found != file.header.point_count:
             raise ValueError(f"{file.header.point_count} points are announced, {n_found} are there: cut short")

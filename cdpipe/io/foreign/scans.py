@@ -30,6 +30,7 @@ class PosedClouds:
     Attributes:
         name: The recording.
         odom_T_sensor: (S, 4, 4) pose of each scan.
+        stamps_s: (S,) time of each scan, seconds.
         descriptors_in: Folder that stores its descriptors.
         is_temporary: Whether its files go with this object.
     """
@@ -50,7 +51,7 @@ class PosedClouds:
         """
         self.name = clouds.name
         self.odom_T_sensor = odom_T_sensor
-        self._clouds, self._stamps_s, self._motion = clouds, stamps_s, motion
+        self._clouds, self.stamps_s, self._motion = clouds, stamps_s, motion
         self._stamps_ns: Int64Array = np.round((stamps_s - stamps_s[0]) * 1e9).astype(np.int64)
 
     def scan(self, index: int) -> PosedScan:
@@ -96,12 +97,14 @@ class PosedClouds:
         stamps_ns = np.full(np.count_nonzero(is_return), self._stamps_ns[index])
         kept = points[is_return]
         times = None if cloud.times is None else cloud.times[is_return]
-        offset_s = point_times(times, float(self._stamps_s[index])) if self._motion is not None else None
+        offset_s = point_times(times, float(self.stamps_s[index])) if self._motion is not None else None
         if offset_s is not None and self._motion is not None:
-            kept = deskew_points(kept, offset_s, float(self._stamps_s[index]), self._motion)
+            kept = deskew_points(kept, offset_s, float(self.stamps_s[index]), self._motion)
             stamps_ns = stamps_ns + np.round(offset_s * 1e9).astype(np.int64)
         pixels = np.flatnonzero(is_return).astype(np.int32)
-        return PosedScan(index, kept, self.odom_T_sensor[index], stamps_ns, pixels), len(points) - len(pixels)
+        shone = None if cloud.intensity is None else cloud.intensity[is_return]
+        scan = PosedScan(index, kept, self.odom_T_sensor[index], stamps_ns, pixels, intensity=shone)
+        return scan, len(points) - len(pixels)
 
 
 class Repeats:
@@ -172,4 +175,4 @@ class _Moved:
         pose = self._dst_T_src[index]
         is_missing = np.logical_not(cloud.points.any(axis=1))  # stays missing
         moved = cloud.points @ pose[:3, :3].T + pose[:3, 3]
-        return Cloud(np.where(is_missing[:, None], 0.0, moved))
+        return Cloud(np.where(is_missing[:, None], 0.0, moved), intensity=cloud.intensity)

@@ -64,7 +64,7 @@ def write_osf(
             for chunk, more in zip(session.chunks(), fields or repeat({}), strict=fields is not None):
                 _check_fields(session, chunk, more)
                 for row in range(len(chunk.range_mm)):
-                    writer.save(0, _frame(core, info, session, chunk, more, row, done))
+                    writer.save(0, frame_of(core, info, session, chunk, more, row, done))
                     done += 1
                     report("write", done, session.n_scans)
     except OsfDropFrameError as error:
@@ -133,7 +133,7 @@ def _check_fields(session: Session, chunk: ScanChunk, fields: Fields) -> None:
             )
 
 
-def _frame(core: Any, info: Any, session: Session, chunk: ScanChunk, fields: Fields, row: int, number: int) -> Any:
+def frame_of(core: Any, info: Any, session: Session, chunk: ScanChunk, fields: Fields, row: int, number: int) -> Any:
     """Return one revolution as the SDK's `LidarFrame`."""
     whole = {name: getattr(chunk, own)[row] for name, own in _CHANNELS.items()}
     whole |= {name: values[row] for name, values in fields.items()}

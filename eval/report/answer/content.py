@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, Int64Array, transform, travelled_m
+from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, transform, travelled_m
 from cdpipe.core.voxel import thin
 from cdpipe.io.answer import Answer, read_answer
+from cdpipe.io.out.answer_map import require_own_keyframes
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.mapping import choose_keyframes
 from cdpipe.merge.coverage import measure_coverage
@@ -74,7 +75,7 @@ def gather_content(
     """Return the content of an answer to two opened sessions; other arguments and errors as of `read_content`."""
     before, after = sessions
     for source, scans in zip(sessions, report.keyframe_scans, strict=True):
-        _require_own_keyframes(source, scans, report)
+        require_own_keyframes(source, scans, report)
     if report.coverage is None:
         report = replace(report, coverage=measure_coverage(report, before.odom_T_sensor, after.odom_T_sensor))
     alignment = alignment_of(report, after.odom_T_sensor)
@@ -95,19 +96,6 @@ def near_stretches(is_near: BoolArray, *, wanted: bool) -> Iterator[slice]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], is_step, [False]]).astype(np.int8)))
     for start, end in edges.reshape(-1, 2).tolist():
         yield slice(start, end + 1)
-
-
-def _require_own_keyframes(source: ScanSource, scans: Int64Array, report: ChangeReport) -> None:
-    """Raise `InputError` if the keyframes of an answer are not those of a session, as far as its settings tell."""
-    of_map = report.config.get("map")
-    spacing_m = of_map.get("keyframe_spacing_m") if isinstance(of_map, Mapping) else None
-    if isinstance(spacing_m, float) and len(scans) and spacing_m > 0:
-        own = choose_keyframes(source.odom_T_sensor, spacing_m)
-        if not np.array_equal(own, scans):
-            raise InputError(
-                f"{source.name}: the answer has {len(scans)} keyframes up to scan {scans.max()}, this session "
-                f"{len(own)} up to scan {own[-1]}: is it an answer to this pair, and in this order?"
-            )
 
 
 def _with_points(answer: Answer, sessions: tuple[ScanSource, ScanSource]) -> ChangeReport:

@@ -253,10 +253,14 @@ def write_bag(
     poses: str = "tf",
     cloud_topics: Sequence[str] = ("/ouster/points",),
     last_pose_s: float = np.inf,
+    **options: Any,
 ) -> Path:
-    """Write a bag with rosbags: ROS 1 if the name ends in .bag, else ROS 2 with sqlite3; .mcap with package mcap."""
+    """Write a bag with rosbags: ROS 1 if the name ends in .bag, else ROS 2 with sqlite3; .mcap with package mcap.
+
+    The options are those of the writer of MCAP.
+    """
     if path.suffix == ".mcap":
-        return _write_mcap(path, made, poses, cloud_topics, last_pose_s)
+        return _write_mcap(path, made, poses, cloud_topics, last_pose_s, **options)
     from rosbags.rosbag1 import Writer as Writer1  # noqa: PLC0415
     from rosbags.rosbag2 import Writer as Writer2  # noqa: PLC0415
 
@@ -273,12 +277,14 @@ def write_bag(
     return path
 
 
-def _write_mcap(path: Path, made: Drive, poses: str, cloud_topics: Sequence[str], last_pose_s: float) -> Path:
+def _write_mcap(
+    path: Path, made: Drive, poses: str, cloud_topics: Sequence[str], last_pose_s: float, **options: Any
+) -> Path:
     from mcap.writer import Writer  # noqa: PLC0415
 
     messages = RosMessages(made)
     with path.open("wb") as file:
-        writer = Writer(file)
+        writer = Writer(file, **options)
         writer.start(profile="ros2", library="test")
         channels: dict[str, int] = {}
         for topic, kind, time_s, message in messages.all(poses, cloud_topics, last_pose_s):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,8 @@ pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
 
 from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.geometry import transform
-from cdpipe.io.foreign import HowToRead, folder_of_options, guess_format, read_poses
+from cdpipe.io.foreign import HowToRead, convert_recording, folder_of_options, guess_format, read_poses
+from cdpipe.io.ply import read_ply
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.session_check import check_session
 from cdpipe.model.config import MapConfig
@@ -71,7 +74,8 @@ def test_semantic_kitti(tmp_path: Path) -> None:
     assert "calib.txt:1: Tr mirrors" in said(folder)
     (folder / "velodyne" / "000002.bin").write_bytes(b"x" * 30)
     (folder / "calib.txt").unlink()
-    assert "000002.bin: 30 bytes: expected x, y, z, intensity" in said(folder)
+    with pytest.warns(InputWarning, match="no calib.txt beside it: its poses are taken for those of the lidar"):
+        assert "000002.bin: 30 bytes: expected x, y, z, intensity" in said(folder)
 
 
 def test_e57_has_the_poses_of_its_scanner(tmp_path: Path) -> None:
@@ -122,6 +126,67 @@ def test_bags(tmp_path: Path, name: str, poses: str) -> None:
 def test_a_lone_db3_is_a_bag(tmp_path: Path) -> None:
     shutil.copy(next(write_bag(tmp_path / "ros2", MADE).glob("*.db3")), tmp_path / "lone.db3")
     assert worst_m(tmp_path / "lone.db3") < 1e-3
+
+
+@pytest.mark.parametrize("has_index", [True, False])
+def test_an_mcap_without_chunks(tmp_path: Path, has_index: bool) -> None:
+    from mcap.writer import IndexType  # noqa: PLC0415 - only where the extra is installed
+
+    bare = {} if has_index else {"index_types": IndexType.NONE, "use_statistics": False, "use_summary_offsets": False}
+    path = write_bag(tmp_path / "a.mcap", MADE, use_chunking=False, **bare)
+    assert worst_m(path) < 1e-3
+
+
+def shuffle_clouds(db3: Path, order: list[int], repeats: int = 0) -> None:
+    """Let the clouds of a bag arrive in another order, the first ones again at the end; their headers stay."""
+    with closing(sqlite3.connect(db3)) as base, base:
+        (topic,) = base.execute("SELECT id FROM topics WHERE name = '/ouster/points'").fetchone()
+        asked = "SELECT id, timestamp, data FROM messages WHERE topic_id = ? ORDER BY timestamp"
+        rows = base.execute(asked, (topic,)).fetchall()
+        for place, (_, stamp_ns, _) in zip(order, rows, strict=True):
+            base.execute("UPDATE messages SET timestamp = ? WHERE id = ?", (stamp_ns, rows[place][0]))
+        late = [(topic, rows[-1][1] + 1 + n, rows[n][2]) for n in range(repeats)]
+        base.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", late)
+
+
+def test_clouds_of_a_bag_are_sorted_by_their_stamps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_bag(tmp_path / "ros2", MADE)
+    (db3,) = path.glob("*.db3")
+    shuffle_clouds(db3, [0, 3, 1, 2, 5, 4])
+    with pytest.warns(InputWarning, match="2 clouds come after one with a later stamp, and are sorted by header.stamp"):
+        assert worst_m(db3) < 1e-3
+    monkeypatch.setattr("cdpipe.io.foreign.bags._MOST_WAITING", 0)
+    assert "its clouds are up to 1 places out of the order of their stamps" in said(db3)
+
+
+def test_clouds_of_a_bag_that_repeat_a_stamp_are_left_out(tmp_path: Path) -> None:
+    (db3,) = write_bag(tmp_path / "ros2", MADE).glob("*.db3")
+    shuffle_clouds(db3, list(range(6)), repeats=2)
+    with pytest.warns(InputWarning, match="2 of 8 clouds have the stamp of another one, and are left out"):
+        assert worst_m(db3) < 1e-3
+    unset = type(MADE)(np.full(6, 0.5), MADE.clouds)
+    text = said(write_bag(tmp_path / "unset.bag", unset, "none"), HowToRead(trajectory=tmp_path / "t.tum"))
+    assert "too few stamps (1 on 6 clouds): header.stamp was not set" in text
+
+
+def test_a_bag_that_is_none_says_so(tmp_path: Path) -> None:
+    for number, content in enumerate((b"x", b"")):
+        path = tmp_path / f"{number}.bag"
+        path.write_bytes(content)
+        assert "not a readable bag: it begins with none of b'#ROSBAG'" in said(path)
+        assert "copy or record it again" in said(path)
+
+
+def test_intensities_and_times_of_a_bag_become_those_of_its_scans(tmp_path: Path) -> None:
+    folder = write_pcds(tmp_path / "run", MADE)
+    write_trajectory(folder / "t.tum", MADE.stamps_s)
+    convert_recording(folder, tmp_path / "out", HowToRead(), lambda *_: None)
+    for index, scan in enumerate(open_session(folder).scans()):
+        points, scalars = read_ply(tmp_path / "out" / f"{index:06d}.ply", ("intensity", "time"))
+        np.testing.assert_allclose(points, scan.points_sensor, atol=1e-5)
+        np.testing.assert_array_equal(scalars["intensity"], 7.0)
+        np.testing.assert_allclose(scalars["time"], MADE.clouds[index][1], atol=1e-6)
+    assert worst_m(tmp_path / "out") < 0.01  # they are not deskewed again
 
 
 def test_topics_and_poses_that_a_bag_lacks_are_listed(tmp_path: Path) -> None:

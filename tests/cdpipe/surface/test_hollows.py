@@ -8,7 +8,7 @@ from cdpipe.surface.cells import NearReturns, make_cells
 from cdpipe.surface.hollows import measure_hollows
 from cdpipe.surface.places import SurfacePlaces
 from cdpipe.surface.regions import group_regions
-from tests.cdpipe.surface.tunnels import RADIUS_M, about_axis_deg, surveyed, tunnel
+from tests.cdpipe.surface.tunnels import RADIUS_M, about_axis_deg, single_returns, surveyed, tunnel
 
 SIZE_M, DEPTH_M = 0.9, 0.4
 # A bowl fell out of the roof. It widens towards the rock, as everything about an axis does.
@@ -25,7 +25,7 @@ def fallen(x_m: Float64Array, angle_deg: Float64Array) -> Float64Array:
 
 
 def of(returns: NearReturns, kept: BoolArray) -> NearReturns:
-    return NearReturns(returns.points[kept], returns.path_m[kept], returns.weights[kept], returns.map_T_sensor)
+    return single_returns(returns.points[kept], returns.path_m[kept], returns.weights[kept])
 
 
 def hide(returns: NearReturns, within_m: float) -> NearReturns:
@@ -39,9 +39,9 @@ def with_duct(returns: NearReturns) -> NearReturns:
     angle = np.tile(np.linspace(0.0, np.pi, 60), len(x_m) // 60)
     duct = np.column_stack([x_m, -0.6 + 0.15 * np.cos(angle), 1.0 - 0.15 * np.sin(angle)])
     path_m, weights = np.clip(x_m, 0.0, 11.0), np.full(len(x_m), returns.weights[0])
-    return NearReturns(
+    return single_returns(
         np.concatenate([returns.points, duct]), np.concatenate([returns.path_m, path_m]),
-        np.concatenate([returns.weights, weights]), returns.map_T_sensor,
+        np.concatenate([returns.weights, weights]),
     )  # fmt: skip
 
 

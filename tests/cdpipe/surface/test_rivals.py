@@ -21,6 +21,7 @@ from tests.cdpipe.surface.tunnels import (
     about_axis_deg,
     is_inner,
     left_wall,
+    single_returns,
     surveyed,
     true_displacement,
     tunnel,
@@ -95,7 +96,7 @@ def test_where_nothing_moved_the_level_holds(name: str, survey: Survey, unmoved:
 def test_without_returns_or_places_nothing_is_measured(name: str, survey: Survey, unmoved: NearReturns) -> None:
     cells, places, chainage_m = survey
     none = np.zeros(0)
-    no_returns = NearReturns(np.zeros((0, 3)), none, none, PATH)
+    no_returns = single_returns(np.zeros((0, 3)), none, none)
     method = load_method(name)
     for measured in (
         method(cells, no_returns, places, chainage_m, CONFIG),

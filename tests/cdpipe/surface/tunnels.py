@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, make_pose, stream
-from cdpipe.surface.cells import NearReturns, SurfaceCells, make_cells
+from cdpipe.surface.cells import NearReturns, SurfaceCells, make_cells, number_cells
 from cdpipe.surface.places import SurfacePlaces, choose_places
 from cdpipe.surface.unrolled import unroll
 
@@ -45,7 +45,12 @@ def tunnel(sample: int, moved: Moved = nowhere, noise_m: float = NOISE_M, stretc
     noise = rng.normal(0.0, noise_m, n) + rng.normal(0.0, stretch_noise_m, int(errs_with.max()) + 1)[errs_with]
     radius_m = RADIUS_M - moved(x_m, angle_deg) + noise
     points = np.column_stack([x_m, radius_m * np.sin(np.deg2rad(angle_deg)), radius_m * np.cos(np.deg2rad(angle_deg))])
-    return NearReturns(points, path_m, np.full(n, 1.0 / NOISE_M**2), PATH)
+    return single_returns(points, path_m, np.full(n, 1.0 / NOISE_M**2))
+
+
+def single_returns(points: Float64Array, path_m: Float64Array, weights: Float64Array) -> NearReturns:
+    """Near returns of which none are averaged."""
+    return NearReturns(points, path_m, weights, np.ones(len(points), dtype=np.int64), number_cells(points), PATH)
 
 
 def surveyed(returns: NearReturns) -> tuple[SurfaceCells, SurfacePlaces, Float64Array]:

@@ -1,6 +1,8 @@
+import shutil
 from pathlib import Path
 
 import pytest
+import trimesh
 
 from cdpipe.core.errors import InputError
 from eval.cli.tools import check_file
@@ -20,6 +22,24 @@ def test_a_misspelt_key_does_not_change_what_a_file_is(tmp_path: Path, text: str
     with pytest.raises(InputError) as caught:
         check_file(str(path))
     assert said in str(caught.value)
+
+
+def test_the_meshes_that_a_scenario_names_are_opened(tmp_path: Path) -> None:
+    prop = "{name: sign, kind: mesh, change: none, mesh: {path: %s}, place: {between: [start, bend], fraction: 0.5}}"
+    text = "extends: smoke/one_box\nprops:\n" + "".join(f"  - {prop % name}\n" for name in ("good.stl", "bad.stl"))
+    path = tmp_path / "mine.yaml"
+    path.write_text(text.replace("name: sign", "name: other", 1))
+    trimesh.creation.box(extents=(0.6, 0.5, 0.4)).export(tmp_path / "good.stl")
+    (tmp_path / "bad.stl").write_text("no mesh")
+    with pytest.raises(InputError) as caught:
+        check_file(str(path))
+    (line,) = str(caught.value).splitlines()
+    assert line.startswith(f"{path}: props.sign.mesh: ") and "bad.stl: no triangles in it" in line
+    trimesh.creation.box(extents=(600, 500, 400)).export(tmp_path / "bad.stl")
+    with pytest.raises(InputError, match="units: "):
+        check_file(str(path))
+    shutil.copy(tmp_path / "good.stl", tmp_path / "bad.stl")
+    assert check_file(str(path)) == "a scenario"
 
 
 @pytest.mark.parametrize(("name", "kind"), [("smoke", "plan"), ("narrow", "scenario"), ("paper-topn", "preset")])

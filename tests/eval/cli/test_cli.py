@@ -31,7 +31,7 @@ from sim.session import simulate
 
 Result = tuple[int, str, str]
 Command = Callable[..., Result]
-SMALL = ("--set", "sensor.mode=512x10", "--set", "platform.scan_spacing_m=1.0")
+SMALL = ("--world", "sensor.mode=512x10", "--world", "platform.scan_spacing_m=1.0")
 # finds the box with so few returns, which the preset is not tuned for
 FINE = ("--preset", "voxel-diff", "--set", "regions.min_points=8", "--set", "query.threshold=0")
 
@@ -304,7 +304,7 @@ def test_damaged_recordings_are_refused(
 
 def test_sessions_of_different_tunnels_are_refused(pair: Path, tmp_path: Path, command: Command) -> None:
     elsewhere = tmp_path / "elsewhere"
-    wider = ("--set", "tunnel.section.width_m=7", "--set", "tunnel.section.height_m=5")
+    wider = ("--world", "tunnel.section.width_m=7", "--world", "tunnel.section.height_m=5")
     assert command("simulate", "smoke/one_box", "--out", elsewhere, "--quiet", *SMALL, *wider)[0] == 0
     before = tree(tmp_path)
     quiet = command("detect", pair / "before", elsewhere / "after", "--out", tmp_path / "out", "--quiet")
@@ -400,7 +400,7 @@ def test_usage_errors_are_one_line(
 def test_run_score_report_on_one_folder(
     made: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = [word for word in SMALL if word != "--set"]
+    settings = [word for word in SMALL if word != "--world"]
     small = Tools(draw=lambda name, seed, _: load_scenario(name, seed, settings))
     monkeypatch.setattr(runner, "TOOLS", small)
     plan = tmp_path / "mine.yaml"

@@ -26,7 +26,7 @@ from ouster.sdk import osf
 
 Result = tuple[int, str, str]
 Command = Callable[..., Result]
-SMALL = ("--set", "sensor.mode=512x10", "--set", "platform.scan_spacing_m=1.0")
+SMALL = ("--world", "sensor.mode=512x10", "--world", "platform.scan_spacing_m=1.0")
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +177,7 @@ def test_an_interrupt_leaves_nothing(
         source, target = pair / "before", tmp_path / "new" / "a.osf"
     else:
         source, target = tmp_path.parent / "whole.osf", tmp_path / "new" / "a"
-        converting.convert(pair / "before", source, quiet=True)
+        converting.convert([pair / "before"], source, quiet=True)
         monkeypatch.setattr(SessionWriter, "add", interrupted)
     assert command("convert", source, target, "--quiet") == (130, "", "interrupted; nothing was written\n")
     source.with_name("whole.osf").unlink(missing_ok=True)
@@ -188,7 +188,7 @@ def test_a_session_becomes_pcd_files_with_what_moves(tmp_path: Path, command: Co
     pypcd4 = pytest.importorskip("pypcd4", reason="pip install 'tunnelcd[formats]'")
     walker = "movers=[{name: walker, kind: person, path: {length_m: 6}, speed_mps: 1.2, sessions: after}]"
     made = tmp_path / "made"
-    assert command("simulate", "smoke/unchanged", "--seed", "3", "--out", made, "--set", walker, *SMALL)[0] == 0
+    assert command("simulate", "smoke/unchanged", "--seed", "3", "--out", made, "--world", walker, *SMALL)[0] == 0
     source, out = made / "after", tmp_path / "pcds"
     code, said, _ = command("convert", source, out, "--with-truth")
     assert code == 0
@@ -219,6 +219,4 @@ def test_a_session_becomes_pcd_files_with_what_moves(tmp_path: Path, command: Co
     assert command("convert", source, tmp_path / "bare")[0] == 0
     assert not (tmp_path / "bare" / "gt_cloud.pcd").exists()
     refused(command("convert", source, out), "name a new or empty folder")
-    refused(
-        command("convert", source, tmp_path / "a.pcd"), "a new file that ends in .osf, or a new folder of PCD files"
-    )
+    refused(command("convert", source, tmp_path / "a.pcd"), "a new file that ends in .osf, .pcap, .mcap, .bag")

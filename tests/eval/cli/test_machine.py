@@ -97,6 +97,108 @@ def test_a_score_as_json(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_
     assert (code, json.loads(out), err) == (0, {"region_recall": 1.0, "t_cd_s": None}, "")
 
 
+@pytest.mark.parametrize(
+    "words", [("list",), ("list", "settings"), ("check", "smoke", "narrow"), ("check", "smok"), ("doctor",)]
+)
+def test_the_json_is_written_to_a_file_as_well(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    found = [Finding("a", "ok", "1.0", True)]
+    monkeypatch.setattr("eval.cli.doctor.examine", lambda: iter(found))
+    file = tmp_path / "found.json"
+    plain, printed = command(*words), command(*words, "--json")
+    told = command(*words, "--out", file)
+    assert told == plain and told[0] == printed[0]
+    assert file.read_text() == printed[1]
+    assert command(*words, "--json", "--out", file)[1] == printed[1]
+    assert [path.name for path in tmp_path.iterdir()] == ["found.json"]
+
+
+def test_a_score_is_written_to_a_file(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("eval.scoring.scoring.score", lambda *_: {"region_recall": 1.0, "t_cd_s": float("nan")})
+    file = tmp_path / "score.json"
+    assert command("score", tmp_path, tmp_path, "--out", file, "--quiet") == (0, "", "")
+    assert json.loads(file.read_text()) == {"region_recall": 1.0, "t_cd_s": None}
+
+
+@pytest.mark.parametrize(("name", "said"), [(".", "is a folder"), ("none/x.json", "there is no folder")])
+def test_a_file_that_cannot_be_written_is_refused_before_the_work(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, said: str
+) -> None:
+    monkeypatch.setattr("eval.cli.doctor.examine", lambda: pytest.fail("examined"))
+    code, out, err = command("doctor", "--out", tmp_path / name)
+    assert (code, out, err.count("\n")) == (2, "", 1) and said in err
+
+
+@pytest.mark.parametrize("kind", ["scenarios", "plans", "presets", "sensors", "settings"])
+def test_every_row_is_described(command: Command, kind: str) -> None:
+    rows = json.loads(command("list", kind, "--json")[1])
+    assert rows and all(len(row["description"].split()) > 1 for row in rows)
+    if kind == "settings":
+        assert [row["name"] for row in rows if not row["unit"]] == []
+
+
+def test_settings_of_world_and_method_are_told_apart(command: Command, tmp_path: Path) -> None:
+    out = ("--out", tmp_path / "out")
+    code, _, err = command("simulate", "smoke/one_box", "--world", "query.radius_m=3", *out)
+    assert code == 2 and "of a method, not of the world" in err
+    code, _, err = command("detect", tmp_path, tmp_path, "--set", "sensor.mode=512x10", *out)
+    assert code == 2 and "of the world, not of a method" in err and "`tunnelcd simulate` by --world" in err
+    code, _, err = command("run", "smoke", "--set", "sensor.mode=512x10", *out)
+    assert code == 2 and "write it into the plan" in err
+    code, _, err = command("simulate", "smoke/one_box", "--world", "sensor.mod=x", *out)
+    assert (code, err) == (2, "error: --world: sensor.mod = 'x': unknown key; did you mean \"sensor.mode\"?\n")
+    code, _, err = command("simulate", "smoke/one_box", "--set", "sensor.mod=x", *out)
+    warning, error = err.splitlines()
+    assert code == 2 and warning.startswith("warning: --set: ") and error.startswith("error: --world: sensor.mod")
+    assert not list(tmp_path.iterdir())
+
+
+# of each shell: what it sets, and what it reads
+SHELLS = {
+    "bash": lambda words: {
+        "_TUNNELCD_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(words), "COMP_CWORD": str(len(words) - 1),
+    },
+    "zsh": lambda words: {"_TUNNELCD_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": " ".join(words)},
+    "fish": lambda words: {
+        "_TUNNELCD_COMPLETE": "complete_fish", "_TYPER_COMPLETE_ARGS": " ".join(words),
+        "_TYPER_COMPLETE_FISH_ACTION": "get-args",
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("shell", "words", "expected"),
+    [
+        ("zsh", "simulate smoke/", {"smoke/one_box", "smoke/unchanged"}),
+        ("fish", "simulate smoke/", {"smoke/one_box", "smoke/unchanged"}),
+        *(("bash", words, expected) for words, expected in [
+        ("simulate smoke/", {"smoke/one_box", "smoke/unchanged"}), ("run fact", {"factorial"}),
+        ("detect a b --preset paper-", {"paper-paired", "paper-topn"}),
+        ("detect a b --set query.radius", {"query.radius_m="}), ("dataset --release l", {"lite"}),
+        ("simulate narrow --world sensor.sub", {"sensor.sub_rays="}), ("report run --against octo", {"octomap"}),
+        ("list sett", {"settings"}),
+        ]),
+    ],
+)  # fmt: skip
+def test_a_shell_completes_names_and_loads_nothing_heavy(shell: str, words: str, expected: set[str]) -> None:
+    program = (
+        "import atexit, sys\n"
+        "heavy = {'torch', 'mujoco', 'scipy', 'pandas', 'trimesh', 'numpy'}\n"
+        "atexit.register(lambda: print('heavy:', *(heavy & set(sys.modules)), file=sys.stderr))\n"
+        "from cdpipe.core.program import main\nmain()\n"
+    )
+    environment = {**os.environ, **SHELLS[shell](["tunnelcd", *words.split()])}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False,
+        cwd=Path(__file__).parents[3],
+    )  # fmt: skip
+    assert done.stderr == "heavy:\n"
+    found = [line.strip('(" )') for line in done.stdout.replace("' '", "\n").splitlines()]
+    assert {name for name in expected if any(name in line for line in found)} == expected
+    assert len([line for line in found if line]) <= len(expected) + 2
+
+
 def test_json_holds_nothing_that_a_terminal_obeys(capsys: pytest.CaptureFixture[str]) -> None:
     echo_json({"a\x1b[2J": ["\x9b", float("inf"), True, Path("x")]})
     out = capsys.readouterr().out
@@ -120,12 +222,12 @@ def test_an_interrupt_is_one_line_from_the_first_moment_on(moment: str) -> None:
             "        if name == 'eval.cli.main':\n"
             "            print('there', flush=True); time.sleep(30)\n"
             "sys.meta_path.insert(0, Slow())\n"
-            "from eval.cli.start import main\nmain()\n"
+            "from cdpipe.core.program import main\nmain()\n"
         ),
         "command": (
             "import time, eval.cli.doctor as doctor\n"
             "doctor.examine = lambda: (print('there', flush=True), time.sleep(30))\n"
-            "from eval.cli.start import main\nmain()\n"
+            "from cdpipe.core.program import main\nmain()\n"
         ),
     }[moment]
     process = subprocess.Popen(

@@ -87,7 +87,7 @@ def test_view_writes_the_page_of_a_stored_answer(
         (["after", "before", "{answer}"], "is it an answer to this pair"),
         (["before", "absent", "{answer}"], "absent: no such file or folder"),
         (["before", "after", "absent"], "absent/answer.json: missing"),
-        (["before", "after", "{answer}", "--seed", "3"], "leave --seed and --set out"),
+        (["before", "after", "{answer}", "--seed", "3"], "leave --seed and --world out"),
         (["before", "after", "{answer}", "--html", "none/x.html"], "there is no folder none"),
     ],
 )

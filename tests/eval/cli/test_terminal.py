@@ -57,7 +57,7 @@ def test_errors(capsys: pytest.CaptureFixture[str]) -> None:
     "argv",
     [
         ("check", HOSTILE), ("check", f"{HOSTILE}.yaml"), ("run", HOSTILE, "--out", "x"), ("report", HOSTILE),
-        ("simulate", "smoke/one_box", "--out", "x", "--set", HOSTILE), ("detect", HOSTILE, "b", "--out", "x"),
+        ("simulate", "smoke/one_box", "--out", "x", "--world", HOSTILE), ("detect", HOSTILE, "b", "--out", "x"),
         ("score", HOSTILE), ("view", HOSTILE), ("convert", HOSTILE, "x"),
         ("dataset", HOSTILE, "--seeds", "0:1", "--out", "x"),
         ("train", HOSTILE, "--out", "x"), (HOSTILE,), ("run", "smoke", "--out", "x", "--limit", HOSTILE),

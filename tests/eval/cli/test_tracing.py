@@ -8,7 +8,7 @@ import yaml
 
 from eval.cli.main import main
 
-SMALL = ("--set", "sensor.mode=512x10", "--set", "platform.scan_spacing_m=4")
+SMALL = ("--world", "sensor.mode=512x10", "--world", "platform.scan_spacing_m=4")
 
 
 def run(capsys: pytest.CaptureFixture[str], *argv: object) -> tuple[int, str, str]:

@@ -16,7 +16,7 @@ from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 from eval.core.domains import domain_of, is_change_in_distribution
-from eval.scoring.scoring import METRICS_VERSION, CaseScore, score_stored
+from eval.scoring.scoring import METRICS_VERSION, CaseScore, score, score_stored
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 from sim.session.truth import MIXED, read_labels, write_labels
 
@@ -627,3 +627,10 @@ def test_answers_that_cannot_be_are_refused_in_one_line(
 def test_a_pair_without_truth_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="only simulated pairs have truth"):
         score_stored(load_ground_truth(tmp_path), tmp_path)
+
+
+def test_scoring_writes_nothing_into_the_pair(tiny_pair: Path, tmp_path: Path) -> None:
+    write_failure(tmp_path / "answer", "nothing", "failed", "none", {}, {})
+    before = {path: path.stat().st_mtime_ns for path in (tiny_pair, *tiny_pair.rglob("*"))}
+    assert score(tmp_path / "answer", tiny_pair)["region_recall"] == 0
+    assert {path: path.stat().st_mtime_ns for path in (tiny_pair, *tiny_pair.rglob("*"))} == before

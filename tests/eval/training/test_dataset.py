@@ -330,7 +330,7 @@ def test_another_recipe_or_somebody_s_folder_is_refused(
         ((FAMILY, "--seeds", "5:5"), "error: --seeds 5:5: expected"),
         ((FAMILY, "--seeds", "x"), "error: --seeds x: expected"),
         ((FAMILY, FAMILY, "--seeds", "0"), "one is named twice"),
-        ((FAMILY, "--seeds", "0", "--set", "tunel=1"), "tunel"),
+        ((FAMILY, "--seeds", "0", "--world", "tunel=1"), "tunel"),
         ((FAMILY, "--seeds", "0", "--workers", "2", "--scheduler", "tcp://a:1"), "leave one of the two out"),
     ],
 )

@@ -370,7 +370,7 @@ def test_what_is_asked_for_is_found_or_named(pair: Path, tmp_path: Path, monkeyp
     assert load_view(str(pair / "after")).bands == ()
     for what, seed, words in (
         (str(pair / "truth"), None, "neither a simulated pair nor a session"),
-        (str(pair), 3, "leave --seed and --set out"),
+        (str(pair), 3, "leave --seed and --world out"),
         ("smoke/one_bo", None, 'did you mean "smoke/one_box"'),
         (str(tmp_path / "gone"), None, "neither a folder nor a scenario"),
         (str(tmp_path / "gone.yaml"), None, "no such file"),

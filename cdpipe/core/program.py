@@ -1,0 +1,49 @@
+"""The program `tunnelcd` from its first moment, before the packages of the command line are imported.
+
+Ctrl-C ends it in one line. A folder or module called `eval`, `scenarios` or `sim` that hides one of ours is named:
+PYTHONPATH and the script's folder come before the installed packages.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+
+_HOME = Path(__file__).resolve().parents[2]
+_PACKAGES = ("eval", "scenarios", "sim")
+
+
+def main() -> None:
+    """Run the command line and exit; an interrupt before it runs ends with exit code 130, as one while it runs."""
+    handler = signal.signal(signal.SIGINT, _leave)
+    for name in _PACKAGES:
+        if other := find_hiding(name):
+            sys.stderr.write(
+                f"error: {other}: hides the package {name} of tunnelcd, as it comes first on Python's path: rename it, "
+                "or leave its folder out of PYTHONPATH\n"
+            )
+            raise SystemExit(2)
+    run = importlib.import_module("eval.cli.main").main
+    signal.signal(signal.SIGINT, handler)
+    run()
+
+
+def find_hiding(name: str) -> str:
+    """Return the file or folder that is imported under the name of a package of ours in its place; "" if none is."""
+    found = importlib.util.find_spec(name)
+    places = [Path(place).resolve() for place in (found.submodule_search_locations or ())] if found else []
+    if found is None or _HOME / name in places:
+        return ""
+    return str(found.origin or places[0])
+
+
+def _leave(_number: int, _frame: FrameType | None) -> None:
+    """End at once: nothing was begun, and an exception inside an import may be swallowed there."""
+    sys.stderr.write("interrupted; nothing was written\n")
+    sys.stderr.flush()
+    os._exit(130)

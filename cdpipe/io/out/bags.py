@@ -1,0 +1,85 @@
+"""Bags that RViz and Foxglove play: ROS 2 with sqlite3 (a folder), MCAP, and ROS 1.
+
+    /points   PointCloud2 in frame `lidar`, stamped at the first column: x, y, z, t, intensity, ring, and added fields
+    /tf       `lidar` in `odom`, 21 times in each revolution
+    /clock    at the same times
+
+Points of a session are not deskewed: `t` and /tf say where each was taken. Those of other recordings are, without `t`.
+"""
+
+# ruff: noqa: PLC0415 - rosbags and mcap are extras, and everybody else must be able to import this
+
+from __future__ import annotations
+
+import errno
+import inspect
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from cdpipe.core.plugins import require_extra
+from cdpipe.io.out.ros import CLOCK, CLOUD, TRANSFORMS, RosMessages
+from cdpipe.io.out.scans import Outgoing, Progress
+
+TOPICS = {"/points": CLOUD, "/tf": TRANSFORMS, "/clock": CLOCK}
+_Write = Callable[[str, int, bytes], None]
+_VERSION = 8  # of the metadata of a ROS 2 bag; newer versions of rosbags ask for it
+
+
+def write_bag(path: Path, outgoing: Outgoing, kind: str, report: Progress) -> None:
+    """Write a session or recording as a bag.
+
+    Args:
+        path: New file; of `ros2` a new folder.
+        outgoing: What to write.
+        kind: "ros1", "ros2" or "mcap".
+        report: Called with the stage, the number of finished scans and their total.
+
+    Raises:
+        InputError: The extra `formats` is not installed, or a scan cannot be read.
+        OSError: The file cannot be written.
+    """
+    require_extra("formats", str(path))
+    messages = RosMessages(is_first=kind == "ros1")
+    opened = _open_mcap(path, messages) if kind == "mcap" else _open_bag(path, messages)
+    with opened as write:
+        for scan in outgoing.sweeps(report):
+            for stamp_ns, pose in zip(scan.path_ns.tolist(), scan.path, strict=True):
+                write("/clock", stamp_ns, messages.serialize(CLOCK, messages.clock(stamp_ns)))
+                write("/tf", stamp_ns, messages.serialize(TRANSFORMS, messages.transform(stamp_ns, pose)))
+            # a driver sends a revolution when it is complete
+            write("/points", int(scan.path_ns[-1]), messages.serialize(CLOUD, messages.cloud(scan)))
+
+
+@contextmanager
+def _open_bag(path: Path, messages: RosMessages) -> Iterator[_Write]:
+    from rosbags import rosbag1, rosbag2
+
+    make: Any = rosbag1.Writer if messages.is_first else rosbag2.Writer
+    options = {"version": _VERSION} if "version" in inspect.signature(make).parameters else {}
+    try:
+        with make(path, **options) as bag:
+            topics = {
+                topic: bag.add_connection(topic, kind, typestore=messages.store) for topic, kind in TOPICS.items()
+            }
+            yield lambda topic, stamp_ns, content: bag.write(topics[topic], stamp_ns, content)
+    except sqlite3.Error as error:
+        raise OSError(errno.EIO, str(error)) from error
+
+
+@contextmanager
+def _open_mcap(path: Path, messages: RosMessages) -> Iterator[_Write]:
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        writer: Any = Writer(file)
+        writer.start(profile="ros2", library="tunnelcd")
+        channels = {}
+        for topic, kind in TOPICS.items():
+            text, _ = messages.store.generate_msgdef(kind, ros_version=2)
+            schema = writer.register_schema(kind, "ros2msg", text.encode())
+            channels[topic] = writer.register_channel(topic, "cdr", schema)
+        yield lambda topic, stamp_ns, content: writer.add_message(channels[topic], stamp_ns, content, stamp_ns)
+        writer.finish()

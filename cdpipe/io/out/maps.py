@@ -1,0 +1,59 @@
+"""The map of a session or recording: its returns in the odom frame, one a cell, with their values."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cdpipe.core.geometry import BoolArray, Float64Array, transform
+from cdpipe.core.voxel import UniqueCells, cell_keys
+from cdpipe.io.out.scans import Outgoing, OutScan, Progress
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointMap:
+    """Points (N, 3), metres, and values (N,) of each by name; values of 64 bits are times."""
+
+    points: Float64Array
+    scalars: dict[str, npt.NDArray[Any]]
+
+
+def gather_map(outgoing: Outgoing, cell_m: float, report: Progress) -> PointMap:
+    """Return the first return of each cell, and of each `change` in it, in the odom frame.
+
+    The values are the scalars of the scans, `time` (seconds of the recording's clock) and `scan`.
+
+    Raises:
+        InputError: A scan cannot be read, or lies too far away.
+    """
+    cells: defaultdict[int, UniqueCells] = defaultdict(UniqueCells)
+    points: list[Float64Array] = []
+    scalars: defaultdict[str, list[npt.NDArray[Any]]] = defaultdict(list)
+    for scan in outgoing.scans(report):
+        points_odom = transform(scan.odom_T_sensor, scan.points)
+        is_first = _find_first(scan, points_odom, cells, cell_m)
+        points.append(points_odom[is_first])
+        for name, values in _values(scan).items():
+            scalars[name].append(values[is_first])
+    return PointMap(np.concatenate(points), {name: np.concatenate(parts) for name, parts in scalars.items()})
+
+
+def _find_first(scan: OutScan, points: Float64Array, cells: dict[int, UniqueCells], cell_m: float) -> BoolArray:
+    is_first = np.zeros(len(points), np.bool_)
+    changes = scan.scalars.get("change", np.zeros(len(points), np.int32))
+    for change in np.unique(changes).tolist():
+        rows = np.flatnonzero(changes == change)
+        n_known = len(cells[change])
+        ids, first = np.unique(cells[change].add(cell_keys(points[rows], cell_m)), return_index=True)
+        is_first[rows[first[ids >= n_known]]] = True
+    return is_first
+
+
+def _values(scan: OutScan) -> dict[str, npt.NDArray[Any]]:
+    n = len(scan.points)
+    time_ns = np.full(n, scan.stamp_ns) if scan.offset_ns is None else scan.stamp_ns + scan.offset_ns
+    return scan.scalars | {"time": time_ns / 1e9, "scan": np.full(n, scan.index, np.int32)}
