@@ -41,7 +41,7 @@ def demo(out: RunOut, quiet: Quiet = False) -> None:
     from eval.plans.plan import load_plan
     from eval.report.page import write_page
 
-    _run(load_plan("paper"), out, HERE, quiet=quiet)
+    _run(load_plan("paper"), out, HERE, force=False, limit=None, quiet=quiet)
     page = write_page(out)
     echo(f"page: {page}")
 
