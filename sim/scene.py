@@ -7,7 +7,7 @@ surfaces are kept. Their order is the order of the geoms in a single model of th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -145,8 +145,9 @@ def build_world(scenario: Scenario, seed: int) -> World:
         heaps = tuple(rubble_points(displacement, HEAP_M))
         changed = level, bare_after, fixed_after, fixtures_after, heaps
         rock_after = compile_moved(ground, displacement.walls.mesh("after"), fixtures_after)
+    bodies = {item: compile_prop(item) for item in standing}
     before, after = (
-        compile_scene(scenario, own, ground.fixtures, standing, session)
+        compile_scene(scenario, own, ground.fixtures, bodies, session)
         for own, session in ((ground.rock, "before"), (rock_after, "after"))
     )
     told = ground.centreline, ground.walls, ground.fixed, ground.fixtures, tuple(standing), before, after
@@ -173,7 +174,7 @@ def lay_ground(scenario: Scenario, seed: int) -> Ground:
         furniture = leave_out_broken(furniture, displacement)
     # Compiling takes the most memory, so it is done before the other ray casters exist.
     rock = [compile_mesh(mesh) for mesh in (wall, *(fixture.mesh for fixture in furniture))]
-    hung = Caster([wall, *(fixture.mesh for fixture in furniture)]) if furniture else walls
+    hung = Caster([wall, *(fixture.mesh for fixture in furniture)], onto=walls) if furniture else walls
     gap_m = WALL_GAP_M + (tunnel.resolution_m if tunnel.mesh is None else 0.0)
     around, outlines, after = Surroundings(walls, hung, gap_m), [], None
     if displacement is not None:
@@ -189,7 +190,7 @@ def lay_ground(scenario: Scenario, seed: int) -> Ground:
     else:
         fixtures = (*furniture, stones)
         rock.append(compile_mesh(stones.mesh))
-        fixed = Caster([wall, *(fixture.mesh for fixture in fixtures)])
+        fixed = Caster([wall, *(fixture.mesh for fixture in fixtures)], onto=hung)
     return Ground(centreline, walls, fixed, fixtures, tuple(standing), tuple(rock), around, displacement, after)
 
 
@@ -199,7 +200,7 @@ def follow_rock(
     """Return obstacles and furniture as they are in the after session, given its bare tunnel."""
     moved = follow(fixtures, displacement)
     wall = displacement.walls.mesh("after")
-    return (Caster([wall, *(fixture.mesh for fixture in moved)]) if moved else bare_after), moved
+    return (Caster([wall, *(fixture.mesh for fixture in moved)], onto=bare_after) if moved else bare_after), moved
 
 
 def compile_moved(ground: Ground, wall: Mesh, fixtures: Sequence[Fixture]) -> tuple[Mesh, ...]:
@@ -209,7 +210,11 @@ def compile_moved(ground: Ground, wall: Mesh, fixtures: Sequence[Fixture]) -> tu
 
 
 def compile_scene(
-    scenario: Scenario, rock: Sequence[Mesh], fixtures: Sequence[Fixture], standing: Sequence[Standing], session: str
+    scenario: Scenario,
+    rock: Sequence[Mesh],
+    fixtures: Sequence[Fixture],
+    bodies: Mapping[Standing, tuple[Mesh, ...]],
+    session: str,
 ) -> Scene:
     """Return the scene of one session: the wall, the fixtures, then every prop that stands in this session.
 
@@ -217,21 +222,21 @@ def compile_scene(
         scenario: Numbers the props and says how bright the rock is.
         rock: The wall and the fixtures after compilation, see `compile_mesh`.
         fixtures: The fixtures, in the order of `rock[1:]`.
-        standing: Props at their places, of both sessions.
+        bodies: Props at their places, of both sessions, each with its geoms, see `compile_prop`.
         session: "before" or "after".
     """
     shares = REFLECTIVITY | {"rock": scenario.tunnel.reflectivity}  # loose stones were blasted from the walls
     numbers = {prop.name: number for number, prop in enumerate(scenario.props, start=1)}
     parts, materials = [WALL, *(each.name for each in fixtures)], ["rock", *(each.material for each in fixtures)]
     instance, reflectivity = [0] * len(rock), [shares[material] for material in materials]
-    here = [item for item in standing if session in item.sessions]
+    here = [item for item in bodies if session in item.sessions]
     for item in here:
         for solid in item.shape.solids:
             parts.append(item.prop.name)
             instance.append(numbers[item.prop.name])
             reflectivity.append(item.prop.reflectivity or shares[solid.material])
             materials.append(solid.material)
-    meshes = (*rock, *model_meshes(*compile_model([], here)))
+    meshes = (*rock, *(mesh for item in here for mesh in bodies[item]))
     return Scene(
         meshes,
         Caster(meshes),
@@ -245,6 +250,11 @@ def compile_scene(
 def compile_mesh(mesh: Mesh) -> Mesh:
     """Return a fixed mesh after MuJoCo compiled it, world frame: float32 vertices relative to the mesh's centre."""
     return model_meshes(*compile_model([mesh], []))[0]
+
+
+def compile_prop(item: Standing) -> tuple[Mesh, ...]:
+    """Return the geoms of a prop at its place after MuJoCo compiled it, world frame."""
+    return tuple(model_meshes(*compile_model([], [item])))
 
 
 def compile_model(fixed: Iterable[Mesh], standing: Iterable[Standing]) -> tuple[mujoco.MjModel, mujoco.MjData]:

@@ -167,9 +167,14 @@ def stacked(tunnels: Sequence[TunnelShard], names: Sequence[str]) -> dict[str, T
 
 
 def read_place_data(tunnels: Sequence[TunnelShard]) -> PlaceData:
-    """Read the scans of both sessions for the training of the scan descriptor."""
+    """Read the scans of both sessions for the training of the scan descriptor.
+
+    Of a tunnel with several after sessions only the first shard is read: its places must not count as other ones.
+    """
     columns: dict[str, list[Any]] = {name: [] for name in PlaceData.__dataclass_fields__}
-    for place, tunnel in enumerate(tunnels):
+    first = {(tunnel.family, tunnel.seed): tunnel for tunnel in reversed(tunnels)}
+    kept = [tunnel for tunnel in tunnels if first[tunnel.family, tunnel.seed] is tunnel]
+    for place, tunnel in enumerate(kept):
         for number, session in enumerate(("before", "after")):
             names = f"{session}_ranges_m", f"{session}_world_T_keyframe"
             arrays, _ = read_shard(tunnel.path, names)

@@ -240,13 +240,26 @@ def report(
         typer.Option(help="3-D views beside the page: of the first and the worst pairs, none, or all"),
     ] = "chosen",
     slim: Annotated[
-        bool, typer.Option("--slim", help="charts as pictures, and pictures compressed: a fifth of the bytes")
+        bool, typer.Option("--slim/--sharp", help="pictures compressed; or with every pixel, four times the bytes")
+    ] = True,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="keep pictures of the page that is there where their sessions are gone")
+    ] = False,
+    index: Annotated[
+        bool, typer.Option("--index", help="RUN is a folder of reports: write the page that leads to all of them")
     ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Write one offline page with tables, plots and pictures of a run; or of the differences between two runs."""
     from cdpipe.core.errors import InputError
 
+    if index:
+        from eval.report.framing.catalogue import write_index
+
+        if other is not None or against is not None or out is not None:
+            raise InputError("--index: an index is of one folder of reports: leave B, --against and --out out")
+        echo(f"page: {write_index(Path(folder))}")
+        return
     if other is None and against is None:
         from eval.report.page import write_page
         from eval.running.runfolder import open_run_folder
@@ -255,11 +268,11 @@ def report(
             raise InputError("--out: the page of a run lies in its folder: leave --out to a comparison")
         run = open_run_folder(Path(folder))
         with shown_progress(quiet) as progress:
-            page = write_page(run.path, views, is_slim=slim, progress=progress)
+            page = write_page(run.path, views, is_slim=slim, keeps=keep, progress=progress)
         echo(f"page: {page}")
         return
-    if slim:
-        raise InputError("--slim: the page of a comparison has no charts to make smaller: leave it out")
+    if not slim:
+        raise InputError("--sharp: the page of a comparison has no pictures to compress: leave it out")
     if other is not None and against is not None:
         raise InputError(f"--against {against}: a second run is named too: write {folder}:{against} {other} instead")
     from eval.report.comparison import compare_sides, write_comparison

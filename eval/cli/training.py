@@ -51,6 +51,7 @@ def dataset(
     draws: Annotated[int, typer.Option(min=1, help="after images of each keyframe; the first is merged exactly")] = 4,
     error_m: Annotated[float, typer.Option(min=0, help="merge error of the other draws: translation, 1 sigma")] = 0.03,
     error_deg: Annotated[float, typer.Option(min=0, help="rotation, 1 sigma per component")] = 0.2,
+    afters: Annotated[int, typer.Option(min=1, max=12, help="after sessions of each tunnel, one shard each")] = 1,
     release: Annotated[
         str | None,
         typer.Option(
@@ -91,7 +92,7 @@ def dataset(
             "dataset: expected FAMILY... with --seeds A:B and --out DIR; --release NAME with --out FILE.zip; or "
             "--unpack FILE.zip with --out DIR"
         )
-    recipe = Recipe(draws, error_m, error_deg, tuple(asked))
+    recipe = Recipe(draws, error_m, error_deg, tuple(asked), afters)
     require_usable(where)
     require_reachable(where)
     warn(exposure(where))

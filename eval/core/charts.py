@@ -1,7 +1,7 @@
 """Charts as data: series over two axes, in panels, with one legend.
 
-A chart is described once. `eval.core.figures.picture` draws it with matplotlib; `eval.report.charts` makes the
-interactive form of the same description for the page.
+A chart is described once. `eval.core.figures.picture` draws it with matplotlib for papers; `eval.report.drawing.charts`
+makes the elements of a page from the same description.
 """
 
 from __future__ import annotations
@@ -16,7 +16,12 @@ import numpy.typing as npt
 
 from cdpipe.core.geometry import Float64Array
 
-Dash = Literal["solid", "dash", "dot", "dashdot"]
+Dash = Literal["solid", "dash", "dot", "dashdot", "longdash", "dashdotdot"]
+# lengths drawn and left out in turn, points
+DASHES: Mapping[Dash, tuple[float, ...]] = {
+    "solid": (), "dash": (4.5, 2.0), "dot": (1.3, 1.6), "dashdot": (5.0, 1.8, 1.3, 1.8), "longdash": (9.0, 2.5),
+    "dashdotdot": (6.0, 1.6, 1.2, 1.6, 1.2, 1.6),
+}  # fmt: skip
 # after Okabe and Ito, which the colour-blind can tell apart
 BLUE, ORANGE, GREEN, VERMILLION, BLACK = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#1a1a1a"
 CONTEXT = "#c4c4c4"
@@ -65,8 +70,8 @@ class Series:
         high: (N,) upper ends.
         is_across: Whether the intervals lie along x.
         labels: (N,) texts written beside the points; () for none.
-        hover: What the page shows under the pointer: one template of plotly, or one for each point. Names of users
-            and files in it need `eval.report.charts.plotly_text`.
+        hover: What the page shows beside a point: one template with places as `{x:.3f}` or `{y:.2g}`, or one text for
+            each point, shown as it is.
     """
 
     x: npt.ArrayLike
@@ -101,14 +106,12 @@ class Heat:
         texts: (R, C) what stands in the cells.
         low: The value that is white.
         high: The value that is blue.
-        hover: Template of plotly for what the page shows under the pointer.
     """
 
     values: Float64Array
     texts: Sequence[Sequence[str]]
     low: float
     high: float
-    hover: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,10 +20,10 @@ from cdpipe.core.names import visible
 from eval.core.charts import (
     BAR_SHARE,
     BLACK,
+    DASHES,
     GRID_COLOUR,
     HEAT_COLOURS,
     SYMBOLS,
-    Dash,
     Drawing,
     Heat,
     Look,
@@ -34,7 +34,6 @@ from eval.core.charts import (
 DPI = 130
 _SLIM_SCALE, _WEBP_QUALITY = 0.75, 30
 _WIDTH_IN, _PX_PER_IN, _LEGEND_CHARACTERS, _LEGEND_LINE_IN = 9.0, 88.0, 145, 0.17
-_DASHES: dict[Dash, Any] = {"solid": "solid", "dash": (0, (5, 2)), "dot": (0, (1, 1.5)), "dashdot": "dashdot"}
 _MARKERS = dict(zip(("", *SYMBOLS), ("", "o", "s", "D", "^", "v", "p", "*", "h", "X"), strict=True))
 
 
@@ -52,13 +51,18 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def data_address(figure: Figure) -> str:
-    """Return a figure as `data:image/png;base64,...`, in 256 colours: a third of the bytes, and no eye sees it."""
+def indexed_png(figure: Figure) -> bytes:
+    """Return a figure as a PNG file in 256 colours: a third of the bytes, and no eye sees it."""
     picture = Image.open(io.BytesIO(png(figure))).convert("RGB")
     buffer = io.BytesIO()
     indexed = picture.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     indexed.save(buffer, format="png", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    return buffer.getvalue()
+
+
+def data_address(figure: Figure) -> str:
+    """Return a figure as `data:image/png;base64,...`, in 256 colours."""
+    return "data:image/png;base64," + base64.b64encode(indexed_png(figure)).decode("ascii")
 
 
 def compress_address(address: str) -> str:
@@ -151,10 +155,17 @@ def _draw_heat(axes: Axes, heat: Heat) -> None:
 
 def _line(look: Look) -> dict[str, Any]:
     return {
-        "color": look.colour, "linewidth": look.width, "linestyle": _DASHES[look.dash] if look.width else "none",
+        "color": look.colour, "linewidth": look.width, "linestyle": _dashes(look),
         "marker": _MARKERS[look.marker], "markersize": look.size, "alpha": look.opacity,
         "markerfacecolor": "white" if look.is_hollow else look.colour,
     }  # fmt: skip
+
+
+def _dashes(look: Look) -> Any:
+    if not look.width:
+        return "none"
+    # matplotlib multiplies by the width of the line
+    return (0, tuple(length / look.width for length in DASHES[look.dash])) if DASHES[look.dash] else "solid"
 
 
 def _legend_entry(name: str, series: Series) -> Line2D | Patch:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from eval.core.charts import BLUE, GREEN, ORANGE, SYMBOLS, Look
 from eval.core.domains import domain_name
 from eval.core.figures import picture_address
 from eval.core.output import make_writable
@@ -23,7 +24,7 @@ from eval.report.settings.effects import effect_chart, signed
 from eval.report.tables import Cell, Picture, Table
 from eval.running.sides import Side, cautions, only_in, short_names, why_no_times
 from eval.tables.columns import Column, spaced
-from eval.tables.rows import records
+from eval.tables.rows import DOMAINS, records
 
 COLOURS = {BETTER: "#d3e7f5", WORSE: "#fbdcc8"}
 MOVED = tuple(COLOURS)
@@ -156,7 +157,12 @@ def picture(table: pd.DataFrame) -> Picture | None:
         return None
     panels = {_COLUMNS[key].heading: rows[rows["metric"] == key] for key in drawn}
     caption = "Dots are means of B \u2212 A over session pairs, lines their 95 % intervals; right of 0 B is better."
-    return Picture("What moved, and how surely", picture_address(effect_chart(panels)), caption)
+    return Picture("What moved, and how surely", picture_address(effect_chart(panels, _look_of_domain)), caption)
+
+
+def _look_of_domain(name: str) -> Look:
+    place = list(map(domain_name, DOMAINS)).index(name)
+    return Look((BLUE, ORANGE, GREEN)[place], marker=SYMBOLS[place], size=4.5)
 
 
 def _content(found: Comparison) -> dict[str, Any]:

@@ -15,11 +15,11 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import BoolArray, Float64Array
-from eval.core.charts import BLACK, BLUE, SYMBOLS, Axis, Drawing, Look, Panel, Series, log_span
+from eval.core.charts import BLACK, BLUE, Axis, Drawing, Look, Panel, Series, log_span
 from eval.core.domains import domain_name
 from eval.core.statistics import mean, mean_with_interval, median
-from eval.report.charts import Chart, plotly_text
-from eval.report.regions.charts import look_of
+from eval.report.drawing.charts import Chart
+from eval.report.drawing.looks import look_of
 from eval.running.run_data import RunData, comparable, stored_table
 from eval.tables.rows import ALL_DOMAINS, DOMAINS, is_told_the_truth, numbers, records
 
@@ -174,15 +174,14 @@ def _name_best(best: Sequence[dict[str, Any]], *, has_legend: bool) -> dict[str,
 def _series(point: dict[str, Any], label: str, names: Sequence[str], title: str) -> Series:
     """Return one method with its label, and with a legend where that has room; without one the front is black."""
     name, is_best = str(point["variant"]), bool(point["is_on_front"])
-    has_legend, place = len(names) <= _MAX_IN_LEGEND, names.index(name)
-    colour = look_of(name, names).colour if has_legend else BLACK if is_best else _GREY
-    marker = SYMBOLS[place % len(SYMBOLS)] if has_legend else "circle"
+    has_legend = len(names) <= _MAX_IN_LEGEND
+    colour = look_of(name).colour if has_legend else BLACK if is_best else _GREY
+    marker = look_of(name).marker if has_legend else "circle"
     interval = f"95 %: {point['low']:.3f} to {point['high']:.3f}, n {point['n_quality']}"
     return Series(
         [point["x"]], [point["quality_value"]], Look(colour, 0.0, marker=marker, is_hollow=not point["competes"]),
         name if has_legend else "", low=[point["low"]], high=[point["high"]], labels=[label],
-        hover=f"<b>{plotly_text(name)}</b><br>{point['quality_value']:.3f} ({interval})<br>{point['x']:.3g}, {title}"
-        "<extra></extra>",
+        hover=[f"{name}: {point['quality_value']:.3f} ({interval}); {point['x']:.3g}, {title}"],
     )  # fmt: skip
 
 

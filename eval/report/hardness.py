@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 
 from eval.core.charts import Axis, Drawing, Look, Panel, Series, named_ticks
-from eval.report.charts import Chart
-from eval.report.regions.charts import look_of
+from eval.report.drawing.charts import Chart
+from eval.report.drawing.looks import look_of
 from eval.report.tables import Cell, Table
 from eval.running.run_data import RunData, stored_table
 from eval.tables.columns import UNDEFINED, share, spaced
@@ -24,9 +24,8 @@ _HOLDS = "holds"
 
 @dataclass(frozen=True, slots=True)
 class Hardness:
-    """The section: a sentence for each method, the table of breaking points, and the slopes."""
+    """The table of breaking points, and the slopes."""
 
-    sentences: tuple[str, ...]
     table: Table
     plots: tuple[Chart, ...]
 
@@ -37,7 +36,7 @@ def draw_hardness(data: RunData) -> Hardness | None:
     if len(steps) == 0 or len(points) == 0:
         return None
     steps, points = (_with_texts(table) for table in (steps, points))
-    return Hardness(_sentences(points), _table(points), (_slopes(steps),))
+    return Hardness(_table(points), (_slopes(steps),))
 
 
 def _with_texts(table: pd.DataFrame) -> pd.DataFrame:
@@ -51,16 +50,26 @@ def _ranked(points: pd.DataFrame) -> list[str]:
     return [str(name) for name in holds.sort_values(ascending=False, kind="stable").index]
 
 
-def _sentences(points: pd.DataFrame) -> tuple[str, ...]:
-    found = []
-    for variant in _ranked(points):
-        own = records(points[(points["variant"] == variant) & points["is_measured"]])
-        broken = [f"{row['axis']} ({_at(row)})" for row in own if row["step"]]
-        n_held = len(own) - len(broken)
-        told = f"breaks at {', '.join(broken)}" if broken else "breaks nowhere"
-        axes = f"holds on {n_held} of {len(own)} axes and {told}" if own else "was not run at every step of any axis"
-        found.append(f"{spaced(variant)} {axes}.")
-    return tuple(found)
+def count_held(points: pd.DataFrame) -> dict[str, int]:
+    """Return on how many axes each method holds, of those that it was run on at every step, most first.
+
+    Args:
+        points: Rows of breaking_points.csv.
+    """
+    measured = points[points["is_measured"]]
+    return {name: int((measured["step"][measured["variant"] == name] == 0).sum()) for name in _ranked(measured)}
+
+
+def name_breaks(points: pd.DataFrame, variant: str) -> str:
+    """Return the axes on which a method breaks, with the values, or that it breaks nowhere.
+
+    Args:
+        points: Rows of breaking_points.csv.
+        variant: The method.
+    """
+    own = records(_with_texts(points[points["is_measured"] & (points["variant"] == variant)]))
+    broken = [f"{row['axis']} ({_at(row)})" for row in own if row["step"]]
+    return f"{variant} breaks at {', '.join(broken)}" if broken else f"{variant} breaks nowhere"
 
 
 def _at(row: Mapping[str, Any]) -> str:
@@ -95,7 +104,8 @@ def _slopes(steps: pd.DataFrame) -> Chart:
     for axis, own in steps.groupby("axis", sort=False):
         values = own.drop_duplicates("step")
         ticks = [_at({"value": value, "unit": ""}) for value in values["value"]]
-        lines = [_line(own[own["variant"] == name], name, names, place) for place, name in enumerate(names)]
+        shifts = np.arange(len(names)) - (len(names) - 1) / 2
+        lines = [_line(own[own["variant"] == name], name, shift) for name, shift in zip(names, shifts, strict=True)]
         limit = Series([-0.4, len(ticks) - 0.6], [BROKEN_BELOW] * 2, Look("#c4c4c4", 0.8))
         title = f"{axis}{f' [{unit}]' if (unit := str(values['unit'].iloc[0])) else ''}"
         x_axis = Axis(title, (-0.4, len(ticks) - 0.6), ticks=named_ticks(ticks))
@@ -110,9 +120,7 @@ def _slopes(steps: pd.DataFrame) -> Chart:
     return Chart("hard", "What breaks whom, and where", Drawing(rows, 210), caption, has_png=True)
 
 
-def _line(own: pd.DataFrame, name: str, names: list[str], place: int) -> Series:
-    look = look_of(name, names)
+def _line(own: pd.DataFrame, name: str, shift: float) -> Series:
     # side by side, so that equal values do not hide each other
-    x = own["step"].to_numpy(dtype=np.float64) - 1 + 0.05 * (place - (len(names) - 1) / 2)
-    shown = Look(look.colour, look.width, look.dash, "circle", 3.0)
-    return Series(x, own["recall_at_0.1"], shown, name, hover="recall %{y:.2f}")
+    x = own["step"].to_numpy(dtype=np.float64) - 1 + 0.05 * shift
+    return Series(x, own["recall_at_0.1"], look_of(name), name, hover="recall {y:.2f}")

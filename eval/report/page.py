@@ -23,8 +23,11 @@ from eval.core.output import require_no_links
 from eval.core.progress import RunProgress
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.targets import read_targets
-from eval.report.charts import Chart, plotly_script
 from eval.report.cost import draw_pareto, pareto_table
+from eval.report.drawing.charts import Chart
+from eval.report.framing.glossary import describe_columns, describe_methods, index_entries
+from eval.report.framing.headline import write_answer, write_title
+from eval.report.framing.kept import KeptPage, keep, read_kept
 from eval.report.hardness import draw_hardness
 from eval.report.latex import latex_tables, to_latex
 from eval.report.merge.merge import draw_merge
@@ -42,7 +45,7 @@ from eval.report.settings.grids import PQ_COLUMN, draw_grids
 from eval.report.site.site import draw_site
 from eval.report.site.views import Views, write_views
 from eval.report.site.worst import draw_worst, worst_rows
-from eval.report.summary import draw_summary
+from eval.report.summary import HEADLINES, draw_summary
 from eval.report.surface.surface import SURFACE_COLUMNS, draw_surface
 from eval.report.tables import Cell, Table, results_table, to_csv, unchanged_table
 from eval.running.run_data import (
@@ -72,7 +75,12 @@ POINT_COLOURS = (
 
 
 def write_page(
-    run: Path, views: Views = "chosen", *, is_slim: bool = False, progress: RunProgress | None = None
+    run: Path,
+    views: Views = "chosen",
+    *,
+    is_slim: bool = True,
+    keeps: bool = False,
+    progress: RunProgress | None = None,
 ) -> Path:
     """Write `index.html` and the tables table1, table2 (.csv, .tex), results.tex and summary.tex into a run folder.
 
@@ -84,7 +92,8 @@ def write_page(
         run: The folder; results.csv must be there, anything else may be missing.
         views: Which pairs get a 3-D view, a file of its own below `views/` that the page links to; "none" for a page
             that is to stand without them.
-        is_slim: Whether charts are pictures and pictures are compressed: a fifth of the bytes.
+        is_slim: Whether pictures are compressed: fewer pixels, edges a little blurred, a quarter of the bytes.
+        keeps: Whether pictures and tables of the page that lies there are kept where the folder cannot make them.
         progress: Told of pairs that are made again for their pictures, unless `views` is "none".
 
     Returns:
@@ -99,8 +108,9 @@ def write_page(
     check_versions(Side(data), Side(data))
     check_extras(Side(data))
     try:
+        kept = read_kept(run / "index.html") if keeps else KeptPage()
         with remade_when_asked(data.folder, progress, is_wanted=views != "none") as folder:
-            files = _draw(replace(data, folder=folder), views, is_slim=is_slim)
+            files = _draw(replace(data, folder=folder), views, kept, is_slim=is_slim)
     except KeyError as error:
         raise InputError(
             f"{run}: a table lacks column {error}: `tunnelcd score {run}` makes the tables anew"
@@ -110,7 +120,7 @@ def write_page(
     return run / "index.html"
 
 
-def _draw(data: RunData, views: Views, *, is_slim: bool) -> dict[str, str | bytes]:
+def _draw(data: RunData, views: Views, kept: KeptPage, *, is_slim: bool) -> dict[str, str | bytes]:
     """Return every file of a page by its name."""
     merges = merge_table(pd.DataFrame(list(data.results)), read_targets(data.provenance))
     content = _about(data, merges)
@@ -137,12 +147,21 @@ def _draw(data: RunData, views: Views, *, is_slim: bool) -> dict[str, str | byte
         for name in ("table1", "table2"):
             files |= {f"{name}.csv": to_csv(content[name]), f"{name}.tex": to_latex(content[name])}
     content["is_slim"] = is_slim
-    if is_slim:
-        content["plotly"] = ""
     content["missing"] = list(dict.fromkeys([*data.left_out, *content["missing"], *content["merge"].missing]))
-    files["index.html"] = render_page("page.html", content)
+    content = keep(content, kept)
+    files["index.html"] = render_page("page.html", content | _define(data, content))
     files |= {f"{chart.name}.png": chart.png for chart in content["charts"] if chart.has_png}
     return files
+
+
+def _define(data: RunData, content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the methods and columns of a page are, and where that stands."""
+    variants = list(dict.fromkeys(str(row["variant"]) for row in data.every_result))
+    status = "ok, or the reason why there is no answer: the merge was refused, or the case failed."
+    besides = "" if content["ends_at_merge"] else "A case that is not ok scores 0 in recall and in every object column."
+    methods = describe_methods(variants)
+    columns = describe_columns(content["columns"], [*content.get("time_meanings", ()), ("status", status, besides)])
+    return {"methods": methods, "definitions": columns, "glossary": index_entries(methods, columns, variants)}
 
 
 def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
@@ -155,8 +174,10 @@ def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
         "finished": str(data.provenance.get("finished") or "unknown"),
         "failures": list_failures(data),
         "settings": tabulate_settings(data),
-        "provenance": json.dumps(data.provenance, indent=2, ensure_ascii=False),
+        "provenance": json.dumps(data.provenance, indent=1, ensure_ascii=False),
         "commits": describe_commits(data),
+        "title": write_title(data),
+        "answer": write_answer(data, merges),
         "summary": draw_summary(data, merges),
         "merge": draw_merge(data),
         "ends_at_merge": ends_at_merge(data),
@@ -164,7 +185,6 @@ def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
         "columns": MERGE_COLUMNS,
         "views": None,
         "charts": (),
-        "plotly": "",
         # the other tables are not missing where a run ends at the merge
         "missing": [line for line in data.missing if line.startswith("provenance.json")],
     }
@@ -222,12 +242,11 @@ def _sections(data: RunData, drawn: Mapping[str, Sequence[Chart]], views: Views)
         "worst": draw_worst(data, variant, worst) if is_mapped else [],
         "worst_variant": variant,
         "charts": charts,
-        "plotly": plotly_script() if charts else "",
         "sites": sites,
         "columns": (
             *(() if regions is None else REGION_COLUMNS), *(() if objects is None else OBJECT_COLUMNS),
             *(() if surface is None else SURFACE_COLUMNS),
-            *RESULT_COLUMNS, *([PQ_COLUMN] if grids else []),
+            *RESULT_COLUMNS, *HEADLINES, *([PQ_COLUMN] if grids else []),
         ),
         "time_meanings": TIME_MEANINGS,
         "point_colours": POINT_COLOURS,

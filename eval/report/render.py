@@ -15,8 +15,8 @@ from eval.core.figures import compress_address
 from eval.core.output import whole_file
 
 _FILES = (
-    "page.html", "comparison.html", "answer.html", "story.html", "leaderboard.html", "parts.html", "page.css",
-    "charts.js", "answer.js", "sort.js",
+    "page.html", "index.html", "comparison.html", "answer.html", "story.html", "leaderboard.html", "parts.html",
+    "page.css", "parts.css", "page.js", "charts.js", "answer.js", "sort.js",
 )  # fmt: skip
 
 

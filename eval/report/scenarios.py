@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from eval.core.charts import Axis, Drawing, Panel, Series, named_ticks
-from eval.report.charts import Chart, plotly_text
-from eval.report.regions.charts import look_of
+from eval.report.drawing.charts import Chart
+from eval.report.drawing.looks import look_of
 from eval.running.run_data import RunData, interval_over_pairs, named_variants, of, over_pairs, scenarios, split_variant
 from eval.tables.columns import RESULT_COLUMNS, select
 
@@ -36,9 +36,8 @@ def draw_scenarios(data: RunData) -> list[Chart]:
             groups = [values[world, name] for world in worlds]
             means = [over_pairs(group, column.key) for group in groups]
             low, high = np.array([interval_over_pairs(group, column.key) for group in groups]).T
-            hover = [f"{plotly_text(world)}: {mean:.3f}" for world, mean in zip(worlds, means, strict=True)]
-            look = look_of(name, methods)
-            series.append(Series(list(ticks), means, look, name, "bars", low=low, high=high, hover=hover))
+            look = look_of(name)
+            series.append(Series(list(ticks), means, look, name, "bars", low=low, high=high, hover="{y:.3f}"))
         is_last = column is _COLUMNS[-1]
         x = Axis(ticks=ticks if is_last else dict.fromkeys(ticks, ""))
         rows.append([Panel(x, Axis(column.heading, (0.0, 1.05)), series)])

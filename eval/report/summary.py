@@ -14,6 +14,7 @@ from cdpipe.core.geometry import Float64Array
 from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
 from eval.report.compared_columns import COMPARED, POOLED, figures_of, is_time
 from eval.report.merge.tables import name_kinds
+from eval.report.surface.surface import SURFACE_COLUMNS
 from eval.report.tables import Cell, Table, methods_table, written_interval
 from eval.running.run_data import (
     Row,
@@ -22,14 +23,18 @@ from eval.running.run_data import (
     covered_by,
     ends_at_merge,
     number,
+    off_grids,
     shown_variant,
     stored_table,
     text,
 )
+from eval.running.runfolder import reported
 from eval.running.sides import is_contended
+from eval.scoring.surface_windows import AREAS_M2
 from eval.tables.columns import Column, fine, select, share, spaced
 from eval.tables.merge_table import ALL_FAMILIES, RIGHT_DEG, RIGHT_M
-from eval.tables.rows import ALL_DOMAINS, PAIR, by_domain, is_told_the_truth, numbers, records
+from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, by_domain, is_told_the_truth, numbers, records, with_domain
+from eval.tables.surface_table import limit_column
 
 _MAX_METHODS = 8
 HEADLINES = select(
@@ -38,12 +43,19 @@ HEADLINES = select(
 )  # fmt: skip
 
 
+SURFACE_HEADLINES = select(
+    SURFACE_COLUMNS, "surface_cover", "surface_error_median_changed_m", "surface_level_inside", "surface_recall",
+    "surface_region_precision", "surface_false_regions_per_100m", *map(limit_column, AREAS_M2), "t_surface_s",
+)  # fmt: skip
+
+
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a page shows first."""
+    """What a page shows first: what the run holds, its headline figures, and those of its pairs where they differ."""
 
     sentence: str
     table: Table
+    of_pairs: Table | None = None
 
 
 def draw_summary(data: RunData, merges: pd.DataFrame) -> Summary:
@@ -53,8 +65,11 @@ def draw_summary(data: RunData, merges: pd.DataFrame) -> Summary:
         data: The run.
         merges: As `eval.tables.merge_table.merge_table` returns it.
     """
-    table = _merge_headlines(merges) if ends_at_merge(data) else _headlines(data)
-    return Summary(_sentence(data, merges), table)
+    told = _sentence(data, merges)
+    if ends_at_merge(data):
+        return Summary(told, _merge_headlines(merges))
+    of_surface = surface_headlines(data)
+    return Summary(told, _headlines(data)) if of_surface is None else Summary(told, of_surface, _headlines(data))
 
 
 def means_by_method(results: pd.DataFrame, columns: Sequence[Column]) -> pd.DataFrame:
@@ -98,9 +113,40 @@ def _mean(values: Float64Array, key: str) -> dict[str, float]:
 
 def _headlines(data: RunData) -> Table:
     """Return the headline figures of each method, best first; what is told the truth comes last."""
+    ranked, shown, figures = rank_methods(data)
+    if len(ranked) == 0:
+        return Table((), ())
+    is_first = ranked.groupby("domain").cumcount() < _MAX_METHODS
+    first = ranked[is_first | (ranked["variant"] == shown_variant(data))]
+    caption = (
+        f"Headline figures: one row is one method, best first, at most {_MAX_METHODS} for each domain; means over "
+        "session pairs (times: median)"
+    )
+    return methods_table(first, shown, figures, caption)
+
+
+def surface_headlines(data: RunData) -> Table | None:
+    """Return the headline figures of a run about rock that moved; None of any other."""
+    table = off_grids(stored_table(data, "surface_table"), data)
+    if len(table) == 0 or "surface" not in reported(data.provenance):
+        return None
+    if table["domain"].nunique() > 1:
+        table = table[table["domain"] != ALL_DOMAINS]
+    oracles_last = table.sort_values("variant", key=lambda names: names.map(is_told_the_truth), kind="stable")
+    shown = [column for column in SURFACE_HEADLINES if table[column.key].notna().any()]
+    caption = "Headline figures: one row is one method; means over session pairs (times: median)"
+    order = oracles_last.sort_values("domain", key=lambda names: names.map(DOMAINS.index), kind="stable")
+    return methods_table(order, shown, with_domain(data.results), caption)
+
+
+def rank_methods(data: RunData) -> tuple[pd.DataFrame, list[Column], pd.DataFrame]:
+    """Return the headline figures of every method in each domain, best first, which of them are shown, and the pairs.
+
+    What is told the truth comes last. Empty where no pair can be compared.
+    """
     cases = comparable(data)
     if len(cases) == 0:
-        return Table((), ())
+        return pd.DataFrame(), [], cases
     figures = figures_of(cases)
     table = means_by_method(figures, HEADLINES)
     if table["domain"].nunique() > 1:  # all pairs together stand in the tables below
@@ -114,14 +160,7 @@ def _headlines(data: RunData) -> Table:
     # higher is better, as written; what is undefined comes last
     ranks = {column.key: -table[column.key].round(2).fillna(-math.inf) for column in shown if column.better == "high"}
     order = pd.DataFrame({"domain": table["domain"], "oracle": table["variant"].map(is_told_the_truth), **ranks})
-    ranked = table.loc[order.sort_values(["domain", "oracle", *ranks], kind="stable").index]
-    is_first = ranked.groupby("domain").cumcount() < _MAX_METHODS
-    first = ranked[is_first | (ranked["variant"] == shown_variant(data))]
-    caption = (
-        f"Headline figures: one row is one method, best first, at most {_MAX_METHODS} for each domain; means over "
-        "session pairs (times: median)"
-    )
-    return methods_table(first, shown, figures, caption)
+    return table.loc[order.sort_values(["domain", "oracle", *ranks], kind="stable").index], shown, figures
 
 
 def _merge_headlines(merges: pd.DataFrame) -> Table:

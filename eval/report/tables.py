@@ -13,7 +13,7 @@ import pandas as pd
 
 from eval.core.domains import domain_name
 from eval.core.statistics import ENOUGH_PAIRS
-from eval.report.charts import Chart
+from eval.report.drawing.charts import Chart
 from eval.running.run_data import (
     Row,
     RunData,
@@ -108,13 +108,16 @@ class Section:
 
 
 def results_table(data: RunData) -> Table:
-    """Return every preset on every scenario with changes: means over its pairs, the best of each scenario marked."""
+    """Return every preset on every scenario with changes: means over its pairs.
+
+    The best of each scenario that is not told the truth is marked.
+    """
     headings = ("preset", *(column.heading for column in RESULT_COLUMNS), "status")
     rows: list[tuple[str, tuple[Cell, ...]]] = []
     for scenario in scenarios(data, unchanged=False):
         variants = named_variants(data, scenario)
         groups = [of(data.results, scenario=scenario, variant=name) for name in variants]
-        columns = [_column_cells(groups, column) for column in RESULT_COLUMNS]
+        columns = [_column_cells(variants, groups, column) for column in RESULT_COLUMNS]
         rows += [
             (scenario, (Cell(spaced(name)), *(column[index] for column in columns), Cell(status_text(groups[index]))))
             for index, name in enumerate(variants)
@@ -191,11 +194,12 @@ def beside(interval: str, n_used: int, n: int) -> str:
     return "\n".join(filter(None, (interval, f"{n_used} of {n} pairs" if 0 < n_used < n else "")))
 
 
-def _column_cells(groups: Sequence[Sequence[Row]], column: Column) -> list[Cell]:
+def _column_cells(variants: Sequence[str], groups: Sequence[Sequence[Row]], column: Column) -> list[Cell]:
     values = [over_pairs(group, column.key) for group in groups]
     counts = [len(defined(group, column.key)) for group in groups]
+    marks = best_fair(variants, values, column, counts)
     cells = []
-    for group, value, n, is_best in zip(groups, values, counts, best(values, column, counts), strict=True):
+    for group, value, n, is_best in zip(groups, values, counts, marks, strict=True):
         interval = written_interval(*interval_over_pairs(group, column.key), column.shown)
         cells.append(Cell(column.shown(value), is_best, beside(interval, n, len(group))))
     return cells
@@ -275,10 +279,16 @@ def group_name(domain: str, rows: Sequence[Mapping[str, Any]]) -> str:
 
 def best_rows(rows: Sequence[Mapping[str, Any]], column: Column, n_used: Sequence[int]) -> list[bool]:
     """Mark the best of the rows that are not told the truth; over how many pairs each is says `n_used`."""
-    fair = [place for place, row in enumerate(rows) if not is_told_the_truth(str(row["variant"]))]
-    marks = best([float(rows[place][column.key]) for place in fair], column, [n_used[place] for place in fair])
+    variants, values = [str(row["variant"]) for row in rows], [float(row[column.key]) for row in rows]
+    return best_fair(variants, values, column, n_used)
+
+
+def best_fair(variants: Sequence[str], values: Sequence[float], column: Column, n_used: Sequence[int]) -> list[bool]:
+    """Mark the best values as `best` does, of the variants that are not told the truth."""
+    fair = [place for place, name in enumerate(variants) if not is_told_the_truth(name)]
+    marks = best([values[place] for place in fair], column, [n_used[place] for place in fair])
     winners = {place for place, is_best in zip(fair, marks, strict=True) if is_best}
-    return [place in winners for place in range(len(rows))]
+    return [place in winners for place in range(len(variants))]
 
 
 def interval_of_row(row: Mapping[str, Any], key: str, shown: Callable[[float], str]) -> str:

@@ -12,7 +12,7 @@ import pandas as pd
 from cdpipe.core.geometry import Float64Array
 from eval.core.charts import BLUE, CONTEXT, ORANGE, Axis, Drawing, Look, Panel, Series
 from eval.core.figures import data_address
-from eval.report.charts import Chart, plotly_script
+from eval.report.drawing.charts import Chart
 from eval.report.render import render_page, write_file
 from eval.report.surface.unrolled import draw_panels
 from eval.report.tables import Cell, Picture, Table
@@ -74,7 +74,6 @@ def _content(
         "has_truth": has_truth,
         "refused": refused_sessions(comparisons),
         "charts": charts,
-        "plotly": plotly_script() if charts else "",
         "radius_m": RADIUS_M,
         "displacements": displacement_table(moved, has_truth=has_truth),
         "unrolled": draw_unrolled_story(comparisons),
@@ -101,12 +100,11 @@ def _panel(own: pd.DataFrame, place: ChosenPlace) -> Panel:
     series = [Series([1, *session], np.zeros(len(session) + 1), Look(CONTEXT, 1.0))]
     if np.isfinite(true_mm).any():
         look = Look(ORANGE, 1.6, marker="square", size=4.0)
-        series.append(Series([1, *session], [0.0, *true_mm], look, "true", hover="session %{x}: %{y:.1f} mm"))
+        series.append(Series([1, *session], [0.0, *true_mm], look, "true", hover="session {x:.0f}: {y:.1f} mm"))
     look = Look(BLUE, 1.2, "dot", "circle", 5.0)
     ends = moved_mm - level_mm, moved_mm + level_mm
-    series.append(
-        Series(session, moved_mm, look, "measured \u00b1 95 % level", "line", *ends, hover="session %{x}: %{y:.1f} mm")
-    )
+    name = "measured \u00b1 95 % level"
+    series.append(Series(session, moved_mm, look, name, "line", *ends, hover="session {x:.0f}: {y:.1f} mm"))
     chainage_m, angle_deg = (float(own[name].median()) for name in ("chainage_m", "angle_deg"))
     where = "" if np.isnan(chainage_m) else f": {chainage_m:.1f} m along, {angle_deg:.0f}\u00b0"
     how = "" if place.chosen_by == "region" else " (given)"

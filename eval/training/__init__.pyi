@@ -1,4 +1,4 @@
-from .dataset import Recipe, make_shard
+from .dataset import Recipe, make_shard, make_shards
 from .dataset_run import make_dataset
 from .training_run import train_descriptor
 
@@ -6,5 +6,6 @@ __all__ = [
     "Recipe",
     "make_dataset",
     "make_shard",
+    "make_shards",
     "train_descriptor",
 ]

@@ -8,7 +8,7 @@ frame and a rotation about the anchor, each component normal, drawn from (seed, 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -36,8 +36,10 @@ from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth, ground_
 from eval.truth.scoring_points import ScoringPointsBuilder
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
-from scenarios.schema import Scenario
-from sim.session.simulate import LabelledSession, simulate_in_memory
+from scenarios.schema import Scenario, SessionPlan
+from sim.session.simulate import LabelledSession
+from sim.session.truth import PairTruth
+from sim.story.afters import simulate_afters
 
 _MAX_CHANGES = 255  # labels are bytes
 # Mapped at a time: their sums stay in the cache, which takes a quarter off the mapping of 64 at a time.
@@ -54,12 +56,19 @@ class Recipe:
         error_m: Standard deviation of each component of a draw's translation.
         error_deg: Standard deviation of each component of a draw's rotation.
         settings: `key=value` settings written over the scenarios.
+        afters: After sessions of each tunnel, all of them compared with its one before session.
     """
 
     draws: int = 4
     error_m: float = 0.03
     error_deg: float = 0.2
     settings: tuple[str, ...] = ()
+    afters: int = 1
+
+    def document(self) -> dict[str, Any]:
+        """Return what files say of it; `afters` only where there are several."""
+        told = asdict(self)
+        return told if self.afters > 1 else {name: value for name, value in told.items() if name != "afters"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +91,7 @@ def shard_digest(scenario: Scenario, seed: int, recipe: Recipe) -> str:
             "scenario": scenario.model_dump(mode="json"),
             "files": file_digests(scenario),
             "seed": seed,
-            "recipe": asdict(recipe),
+            "recipe": recipe.document(),
             "map": _load_map_config().model_dump(mode="json"),
             "image": image,
         }
@@ -90,18 +99,45 @@ def shard_digest(scenario: Scenario, seed: int, recipe: Recipe) -> str:
 
 
 def make_shard(family: str, seed: int, recipe: Recipe) -> bytes:
-    """Simulate one tunnel and return its shard (`cdpipe.training.shard`).
+    """Simulate one tunnel and return the shard of its first after session, see `make_shards`."""
+    return make_shards(family, seed, replace(recipe, afters=1))[0]
+
+
+def make_shards(family: str, seed: int, recipe: Recipe) -> list[bytes]:
+    """Simulate one tunnel and return its shards (`cdpipe.training.shard`), one for each after session.
+
+    Every after session but the first has line and odometry of a draw of its own. World and before session are made and
+    mapped once.
 
     Raises:
         ScenarioError: The world cannot be built, the sessions do not overlap, or changes exceed the labels.
         InputError: A file that the scenario names cannot be read.
     """
     scenario = load_scenario(family, seed, recipe.settings)
-    pair = simulate_in_memory(scenario, seed)
-    if len(pair.truth.changes) > _MAX_CHANGES:
-        raise ScenarioError(f"{family}: {len(pair.truth.changes)} changes, labels can tell {_MAX_CHANGES} apart")
-    before, after = (_map_held(pair.sessions[name]) for name in SESSIONS)
-    truth = ground_truth(pair.truth, {"before": before.truth, "after": after.truth})
+    plans = [_draw_after(family, scenario, seed, recipe, number) for number in range(2, recipe.afters + 1)]
+    shards: list[bytes] = []
+    before: _Mapped | None = None
+    for pair in simulate_afters(scenario, plans, seed):
+        if len(pair.truth.changes) > _MAX_CHANGES:
+            raise ScenarioError(f"{family}: {len(pair.truth.changes)} changes, labels can tell {_MAX_CHANGES} apart")
+        before = before or _map_held(pair.sessions["before"])
+        after = _map_held(pair.sessions["after"])
+        shards.append(_make_pair_shard(family, scenario, pair.truth, (before, after), recipe))
+    return shards
+
+
+def _draw_after(family: str, scenario: Scenario, seed: int, recipe: Recipe, number: int) -> SessionPlan:
+    """Return the after session of a scenario with line and odometry of another draw of its family."""
+    other = int(stream(seed, "dataset-after", str(number)).integers(10_000))
+    drawn = load_scenario(family, other, recipe.settings).after
+    return scenario.after.model_copy(update={"lateral": drawn.lateral, "odometry": drawn.odometry})
+
+
+def _make_pair_shard(
+    family: str, scenario: Scenario, told: PairTruth, mapped: tuple[_Mapped, _Mapped], recipe: Recipe
+) -> bytes:
+    (before, after), seed = mapped, told.seed
+    truth = ground_truth(told, {"before": before.truth, "after": after.truth})
     merged = merged_by_truth(
         _strip_descriptors(before), _strip_descriptors(after), (before.truth, after.truth), OracleMerge(), seed
     )
@@ -119,9 +155,9 @@ def make_shard(family: str, seed: int, recipe: Recipe) -> bytes:
         "seed": seed,
         "split": split_of(seed),
         "digest": shard_digest(scenario, seed, recipe),
-        "recipe": asdict(recipe),
-        "score_radius_m": pair.truth.score_radius_m,
-        "changes": [{"name": change.name, "prop_kind": change.prop_kind} for change in pair.truth.changes],
+        "recipe": recipe.document(),
+        "score_radius_m": told.score_radius_m,
+        "changes": [{"name": change.name, "prop_kind": change.prop_kind} for change in told.changes],
         "counts": _count_arrays(arrays),
     }
     return encode_shard(arrays, about)

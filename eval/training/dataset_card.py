@@ -19,6 +19,7 @@ from cdpipe.core.names import visible
 from cdpipe.training.shard import FIELDS, SUFFIX, read_about, split_of
 from eval.core.output import whole_file
 from eval.plans.splits import version_name
+from eval.plans.worlds import world_slug
 from eval.release.archive import digest_file, write_sums_of
 from eval.release.croissant import FILE, Column, FileGroup, Table, describe_croissant, write_croissant
 
@@ -51,7 +52,8 @@ def write_card(out: Path) -> None:
     """
     rows = [_shard_row(path) for path in out.glob(f"*{SUFFIX}")]
     rows += [_refused_row(path) for path in out.glob("*.refused.json")]
-    rows.sort(key=lambda row: (row["family"], row["seed"]))
+    # the first after session has the shortest name
+    rows.sort(key=lambda row: (row["family"], row["seed"], len(row["shard"]), row["shard"]))
     with whole_file(out / "index.csv") as partial:
         pd.DataFrame(rows, columns=list(INDEX_COLUMNS)).to_csv(partial, index=False)
     document = read_json(out / "dataset.json", "expected a folder made by `tunnelcd dataset`")
@@ -88,11 +90,12 @@ def card(rows: Sequence[Row], recipe: Mapping[str, Any], commands: Sequence[str]
     settings = ", ".join(f"`{each}`" for each in recipe["settings"]) or "none"
     told = "\n".join(f"- {_text(row['family'])} {row['seed']}: {_text(row['reason'])}" for row in refused) or "None."
     made_by = "\n".join(map(visible, commands))
+    one = "One shard is one tunnel" + (" with one of its after sessions" if "afters" in recipe else "")
     return f"""# Training data of change descriptors, made by `tunnelcd dataset`
 
 Simulated tunnels, each driven twice by a ray-cast Ouster OS1-32; between the drives, objects are added, removed or
 moved.
-One shard is one tunnel, and a tunnel is of one split: seeds below 10000 train, 10000 to 19999 validate, 20000 to 29999
+{one}, and a tunnel is of one split: seeds below 10000 train, 10000 to 19999 validate, 20000 to 29999
 test and are never trained on.
 
 {_counts_table(made)}
@@ -106,7 +109,7 @@ score radius of an observable change, negative beyond 1.5 radii of every change,
 | set over the scenarios | {settings} |
 | after images of each pair | {recipe["draws"]}: the first merged exactly, each other off by a merge error of its own |
 | that error, standard deviation of each component | {recipe["error_m"]:g} m and {recipe["error_deg"]:g} deg |
-| digest of all shards | `{digest_of(made)}` |
+{_afters_row(made, recipe)}| digest of all shards | `{digest_of(made)}` |
 | bytes | {sum(row["bytes"] for row in made):,} |
 | version | {version_name()} |
 | licence | MIT, as tunnelcd itself: everything is simulated, nothing was recorded |
@@ -153,6 +156,19 @@ def _text(words: object) -> str:
     return visible(str(words)).replace("&", "&amp;").replace("<", "&lt;").replace("|", "\\|").replace("`", "\\`")
 
 
+def _afters_row(made: Sequence[Row], recipe: Mapping[str, Any]) -> str:
+    """Return what the card says of several after sessions; nothing where each tunnel has one."""
+    if "afters" not in recipe:
+        return ""
+    first = [row for row in made if "-after-" not in row["shard"].removeprefix(world_slug(row["family"]))]
+    n_first, n_all = (sum(row["n_before"] for row in rows) for rows in (first, made))
+    return (
+        f"| after sessions of each tunnel | {recipe['afters']}, a shard each, `...-after-2` and so on from the second; "
+        "they share the before session, the rock and the changes, so their pairs are not independent: "
+        f"{n_first:,} of the {n_all:,} pairs are of a first after session |\n"
+    )
+
+
 def _counts_table(made: Sequence[Row]) -> str:
     counts = [name for name in COUNTS if name != "n_after"]
     lines = [
@@ -161,9 +177,10 @@ def _counts_table(made: Sequence[Row]) -> str:
     ]
     table = pd.DataFrame(made, columns=["family", "split", "seed", *counts])
     for (family, split), own in table.groupby(["family", "split"]):
-        sums = " | ".join(f"{count:,}" for count in (len(own), *own[counts].sum()))
+        sums = " | ".join(f"{count:,}" for count in (own["seed"].nunique(), *own[counts].sum()))
         lines.append(f"| {_text(family)} | {split} | {own['seed'].min()} to {own['seed'].max()} | {sums} |")
-    sums = " | ".join(f"{count:,}" for count in (len(table), *table[counts].sum()))
+    n_tunnels = len(table[["family", "seed"]].drop_duplicates())
+    sums = " | ".join(f"{count:,}" for count in (n_tunnels, *table[counts].sum()))
     return "\n".join([*lines, f"| all | | | {sums} |"])
 
 

@@ -11,7 +11,7 @@ import json
 import time
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from eval.core.progress import RunProgress, Silent
 from eval.plans.plan import parse_seeds_option
 from eval.plans.worlds import world_slug
 from eval.running.runfolder import read_json, write_json
-from eval.training.dataset import Recipe, make_shard, shard_digest
+from eval.training.dataset import Recipe, make_shards, shard_digest
 from eval.training.dataset_card import write_card
 from scenarios.library import load_scenario
 
@@ -46,6 +46,11 @@ class Tunnel:
     def file(self) -> str:
         """Name of its shard."""
         return f"{world_slug(self.family)}-{self.seed}{SUFFIX}"
+
+    def files(self, afters: int) -> list[str]:
+        """Names of its shards, one for each after session; the first is `file`."""
+        stem = self.file.removesuffix(SUFFIX)
+        return [self.file, *(f"{stem}-after-{number}{SUFFIX}" for number in range(2, afters + 1))]
 
     @property
     def refusal(self) -> str:
@@ -95,20 +100,21 @@ def make_dataset(
     tunnels = _tunnels(families, seeds, recipe)
     was_there, is_new = out.exists(), not (out / "dataset.json").is_file()
     _take_folder(out, recipe, command)
-    missing = [tunnel for tunnel in tunnels if not _is_done(out, tunnel)]
+    missing = [tunnel for tunnel in tunnels if not _is_done(out, tunnel, recipe.afters)]
     todo = missing[:limit]
     start, n_pairs = time.perf_counter(), []
     if todo:
         progress.cells("the first tunnel", 0, len(todo))
     try:
         for tunnel in todo:
-            (out / tunnel.file).unlink(missing_ok=True)  # of another digest, and not to be read any more
+            for name in tunnel.files(recipe.afters):
+                (out / name).unlink(missing_ok=True)  # of another digest, and not to be read any more
         with closing(_computed(todo, recipe, where)) as results:
             for n_done, (tunnel, result) in enumerate(results, start=1):
                 _keep(out, tunnel, result)
                 told = "refused"
-                if isinstance(result, bytes):
-                    n_pairs.append(int(read_about(out / tunnel.file)["counts"]["n_before"]))
+                if not isinstance(result, str):
+                    n_pairs.append(len(result) * int(read_about(out / tunnel.file)["counts"]["n_before"]))
                     told = f"{n_pairs[-1]} keyframe pairs"
                 progress.cells(f"{tunnel.family} {tunnel.seed}: {told}", n_done, len(todo))
     finally:
@@ -148,7 +154,7 @@ def _take_folder(out: Path, recipe: Recipe, command: str) -> None:
     """Make the folder, or check that it has the same recipe, and add the command to its list."""
     make_writable(out)
     path = out / "dataset.json"
-    present = {"format": FORMAT, "format_version": FORMAT_VERSION, "recipe": json.loads(json.dumps(asdict(recipe)))}
+    present = {"format": FORMAT, "format_version": FORMAT_VERSION, "recipe": json.loads(json.dumps(recipe.document()))}
     commands: list[str] = []
     if path.is_file():
         document = files.read_json(path, "name a new folder")
@@ -172,52 +178,55 @@ def _told(recipe: Any) -> str:
     """Return a recipe as options of the command."""
     try:
         options = f"--draws {recipe['draws']} --error-m {recipe['error_m']:g} --error-deg {recipe['error_deg']:g}"
+        options += f" --afters {recipe['afters']:d}" if "afters" in recipe else ""
         return " ".join([options, *(f"--world {setting}" for setting in recipe["settings"])])
     except (KeyError, TypeError, ValueError):
         return "something else"
 
 
-def _is_done(out: Path, tunnel: Tunnel) -> bool:
-    """Return whether a tunnel's shard, or its refusal, has the present digest."""
+def _is_done(out: Path, tunnel: Tunnel, afters: int) -> bool:
+    """Return whether all of a tunnel's shards, or its refusal, have the present digest."""
     refusal = out / tunnel.refusal
     if refusal.is_file():
         return bool(read_json(refusal).get("digest") == tunnel.digest != "")
-    if not (out / tunnel.file).is_file():
+    paths = [out / name for name in tunnel.files(afters)]
+    if not all(path.is_file() for path in paths):
         return False
     try:
-        return bool(read_about(out / tunnel.file)["digest"] == tunnel.digest)
+        return all(read_about(path)["digest"] == tunnel.digest for path in paths)
     except (InputError, KeyError):
         return False
 
 
-def _keep(out: Path, tunnel: Tunnel, result: bytes | str) -> None:
-    """Write a shard, or the reason why there is none, completely or not at all."""
+def _keep(out: Path, tunnel: Tunnel, result: list[bytes] | str) -> None:
+    """Write the shards of a tunnel, or the reason why there is none, each completely or not at all."""
     if isinstance(result, str):
         about = {"family": tunnel.family, "seed": tunnel.seed, "digest": tunnel.digest, "reason": result}
         write_json(out / tunnel.refusal, about)
         return
-    with whole_file(out / tunnel.file) as partial:
-        partial.write_bytes(result)
+    for name, content in zip(tunnel.files(len(result)), result, strict=True):
+        with whole_file(out / name) as partial:
+            partial.write_bytes(content)
     (out / tunnel.refusal).unlink(missing_ok=True)
 
 
-def attempt_task(document: str) -> bytes | str:
-    """Return a tunnel's shard, or the reason why it cannot be built; runs on the worker."""
+def attempt_task(document: str) -> list[bytes] | str:
+    """Return a tunnel's shards, or the reason why it cannot be built; runs on the worker."""
     return _attempt(*_TASK.validate_json(document))
 
 
 _TASK = TypeAdapter(tuple[Tunnel, Recipe])
 
 
-def _attempt(tunnel: Tunnel, recipe: Recipe) -> bytes | str:
+def _attempt(tunnel: Tunnel, recipe: Recipe) -> list[bytes] | str:
     try:
-        return make_shard(tunnel.family, tunnel.seed, recipe)
+        return make_shards(tunnel.family, tunnel.seed, recipe)
     except ScenarioError as error:
         return str(error)
 
 
-def _computed(tunnels: Sequence[Tunnel], recipe: Recipe, where: Where) -> Generator[tuple[Tunnel, bytes | str]]:
-    """Yield each tunnel with its shard, or with the reason why there is none, in order of completion."""
+def _computed(tunnels: Sequence[Tunnel], recipe: Recipe, where: Where) -> Generator[tuple[Tunnel, list[bytes] | str]]:
+    """Yield each tunnel with its shards, or with the reason why there is none, in order of completion."""
     yield from ((tunnel, tunnel.refused) for tunnel in tunnels if tunnel.refused)
     wanted = [tunnel for tunnel in tunnels if not tunnel.refused]
     if where == HERE:
@@ -227,7 +236,7 @@ def _computed(tunnels: Sequence[Tunnel], recipe: Recipe, where: Where) -> Genera
             yield from _from_cluster(client, wanted, recipe)
 
 
-def _from_cluster(client: Any, tunnels: Sequence[Tunnel], recipe: Recipe) -> Iterator[tuple[Tunnel, bytes | str]]:
+def _from_cluster(client: Any, tunnels: Sequence[Tunnel], recipe: Recipe) -> Iterator[tuple[Tunnel, list[bytes] | str]]:
     from distributed import as_completed  # noqa: PLC0415 - an extra, and slow to import
 
     waiting = iter(tunnels)

@@ -146,10 +146,12 @@ def _make_task(name: str, training: Sequence[TunnelShard], validation: Sequence[
 
 def _described(tunnels: Sequence[TunnelShard], data_digest: str) -> dict[str, Any]:
     seeds = [tunnel.seed for tunnel in tunnels]
+    n_tunnels = len({(tunnel.family, tunnel.seed) for tunnel in tunnels})
     return {
         "families": sorted({tunnel.family for tunnel in tunnels}),
         "seeds": f"{min(seeds)}:{max(seeds) + 1}",
-        "n_tunnels": len(tunnels),
+        "n_tunnels": n_tunnels,
+        **({"n_after_sessions": len(tunnels)} if len(tunnels) > n_tunnels else {}),
         "n_keyframes": sum(tunnel.n_before for tunnel in tunnels),
         "digest": data_digest,
     }

@@ -18,6 +18,7 @@ from sim.furniture.furniture import Fixture
 from sim.geometry.mesh import Mesh, join_meshes
 from sim.geometry.noise import lattice_values
 from sim.geometry.raycast import Caster
+from sim.geometry.rows import unique_rows
 from sim.geometry.sweep import repeat_body
 from sim.props.rocks import passing_share, rock_mesh
 from sim.rock.axis import UP, Axis, find_nearest, measure_axes, wall_distances
@@ -93,8 +94,8 @@ def _spots_of(axis: Axis, stones: Stones, niche_m: float, keys: dict[str, int]) 
     reach_m = 0.75 * axis.section.width_m + niche_m + 1.0
     reach = int(np.ceil(reach_m / _CELL_M))
     around = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
-    home = np.unique(np.floor(stations[:, :2] / _CELL_M).astype(np.int64), axis=0)
-    cells = np.unique((home[:, None] + around).reshape(-1, 2), axis=0)
+    home = unique_rows(np.floor(stations[:, :2] / _CELL_M).astype(np.int64))
+    cells = unique_rows((home[:, None] + around).reshape(-1, 2))
     expected = _AT_WALL * stones.per_m2 * _CELL_M**2
     n_slots = int(np.ceil(2 * expected))
     slots = np.tile(np.arange(n_slots), len(cells))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -10,6 +11,8 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, Int64Array, require_shape, transform
+
+_REMEMBERED = 256  # cylinders of sizes that are asked for again and again
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,12 +54,16 @@ def drop_unused_vertices(vertices: Float64Array, faces: npt.NDArray[np.integer])
 
 def box_mesh(half_size_m: npt.ArrayLike) -> Mesh:
     """Return a box about the origin, facing outwards, from its half edges (3,)."""
-    return _from_trimesh(trimesh.creation.box(extents=2.0 * np.asarray(half_size_m)))
+    return Mesh(_UNIT_BOX.vertices * (2.0 * np.asarray(half_size_m)), _UNIT_BOX.faces.copy())
 
 
+@lru_cache(maxsize=_REMEMBERED)
 def cylinder_mesh(radius_m: float, half_height_m: float, segments: int) -> Mesh:
-    """Return a closed cylinder about the z axis, facing outwards."""
-    return _from_trimesh(trimesh.creation.cylinder(radius=radius_m, height=2.0 * half_height_m, sections=segments))
+    """Return a closed cylinder about the z axis, facing outwards; its arrays cannot be written."""
+    mesh = _from_trimesh(trimesh.creation.cylinder(radius=radius_m, height=2.0 * half_height_m, sections=segments))
+    for array in (mesh.vertices, mesh.faces):
+        array.setflags(write=False)
+    return mesh
 
 
 def drop_flat_faces(faces: Int64Array) -> Int64Array:
@@ -68,10 +75,15 @@ def drop_flat_faces(faces: Int64Array) -> Int64Array:
 def crop_near(mesh: Mesh, target: Mesh, within_m: float) -> Mesh:
     """Return the triangles of a mesh whose bounding box comes within `within_m` of the bounding box of another."""
     low, high = target.vertices.min(axis=0) - within_m, target.vertices.max(axis=0) + within_m
-    # Compares corners and not triangles: a screen has millions of triangles.
-    is_below, is_above = mesh.vertices < low, mesh.vertices > high
-    is_beside = is_below[mesh.faces].all(axis=1) | is_above[mesh.faces].all(axis=1)
-    return Mesh(mesh.vertices, mesh.faces[~is_beside.any(axis=1)])
+    if (mesh.vertices.max(axis=0) < low).any() or (mesh.vertices.min(axis=0) > high).any():
+        return Mesh(mesh.vertices, mesh.faces[:0])
+    # Compares corners and not triangles: a screen has millions of triangles. One bit for each side of the box.
+    sides = np.zeros(len(mesh.vertices), np.uint8)
+    for axis, column in enumerate(mesh.vertices.T):
+        sides |= (column < low[axis]).view(np.uint8) << np.uint8(axis)
+        sides |= (column > high[axis]).view(np.uint8) << np.uint8(3 + axis)
+    a, b, c = mesh.faces.T
+    return Mesh(mesh.vertices, mesh.faces[(sides[a] & sides[b] & sides[c]) == 0])
 
 
 class NearSurface:
@@ -123,14 +135,38 @@ def cut_triangles(triangles: Float64Array, edge_m: float) -> tuple[Float64Array,
     owners = np.arange(len(triangles))
     done, done_owners = [triangles[:0]], [owners[:0]]
     while len(triangles):
-        lengths = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2)
-        is_long = lengths.max(axis=1) > edge_m
+        longest_m, longest = _longest_edges(triangles)
+        is_long = longest_m > edge_m
         done.append(triangles[~is_long])
         done_owners.append(owners[~is_long])
-        triangles, owners, longest = triangles[is_long], owners[is_long], np.argmax(lengths[is_long], axis=1)
-        rows = np.arange(len(triangles))
-        a, b, c = (triangles[rows, (longest + shift) % 3] for shift in range(3))
+        triangles, owners, longest = triangles[is_long], owners[is_long], longest[is_long]
+        corners, first = triangles.reshape(-1, 3), 3 * np.arange(len(triangles))
+        a, b, c = (corners.take(first + (longest + shift) % 3, axis=0) for shift in range(3))
         middle = (a + b) / 2
-        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-        owners = np.concatenate([owners, owners])
+        triangles = np.empty((2, len(first), 3, 3))
+        triangles[0, :, 0], triangles[0, :, 1], triangles[1, :, 0], triangles[1, :, 1] = a, middle, middle, b
+        triangles[:, :, 2] = c
+        triangles, owners = triangles.reshape(-1, 3, 3), np.concatenate([owners, owners])
     return np.concatenate(done), np.concatenate(done_owners)
+
+
+def _longest_edges(triangles: Float64Array) -> tuple[Float64Array, Int64Array]:
+    """Return the length (N,) of each triangle's longest edge, and the number (N,) of the first corner of that edge.
+
+    Written out by component, because numpy is slow on rows of three.
+    """
+    x, y, z = (np.ascontiguousarray(triangles[:, :, axis].T) for axis in range(3))
+    lengths_m = []
+    for corner in range(3):
+        squares = (x[corner] - x[corner - 2]) ** 2
+        squares += (y[corner] - y[corner - 2]) ** 2
+        squares += (z[corner] - z[corner - 2]) ** 2
+        lengths_m.append(np.sqrt(squares))
+    longest_m, longest = lengths_m[0], np.zeros(len(triangles), np.int64)
+    for corner in (1, 2):
+        longest[lengths_m[corner] > longest_m] = corner
+        longest_m = np.maximum(longest_m, lengths_m[corner])
+    return longest_m, longest
+
+
+_UNIT_BOX = _from_trimesh(trimesh.creation.box())

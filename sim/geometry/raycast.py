@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -47,26 +49,53 @@ class RayCaster(ABC):
         return ranges_m.reshape(width, height), ids.reshape(width, height), cosines.reshape(width, height)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Tree:
+    """One Embree scene, and the number of its first mesh."""
+
+    scene: EmbreeScene
+    geoms: list[TriangleMesh]
+    first: int
+
+
 class Caster(RayCaster):
-    """An Embree scene of one or more meshes, numbered in the order given.
+    """Embree scenes of one or more meshes, numbered in the order given.
 
     Embree works in float32. Coordinates are relative to the centre of the scene, so that a mine of 400 m is resolved
     to 0.02 mm.
 
     Attributes:
         centre_m: (3,) float64 that centre, world frame, whole metres.
+        n_meshes: Number of meshes.
     """
 
-    def __init__(self, meshes: Iterable[Mesh]) -> None:
+    def __init__(self, meshes: Iterable[Mesh], onto: Caster | None = None) -> None:
+        """Build the trees.
+
+        Args:
+            meshes: All meshes.
+            onto: A caster of the first of these meshes. Its trees are shared and only the other meshes get a tree of
+                their own, which is quick to build and slower to cast at. Ranges are those of one tree over all, to the
+                bit: where the centre of all meshes is not that of `onto`, one tree is built.
+        """
         meshes = list(meshes)
-        corners = np.concatenate([mesh.vertices for mesh in meshes])
-        self.centre_m = np.round((corners.min(axis=0) + corners.max(axis=0)) / 2)
-        self._scene = EmbreeScene()
-        self._geoms = [
-            TriangleMesh(self._scene, (mesh.vertices - self.centre_m).astype(np.float32), mesh.faces) for mesh in meshes
-        ]
+        self.n_meshes = len(meshes)
+        # Corner by corner: a copy of all of them would be large.
+        self._low = np.min([mesh.vertices.min(axis=0, initial=np.inf) for mesh in meshes], axis=0)
+        self._high = np.max([mesh.vertices.max(axis=0, initial=-np.inf) for mesh in meshes], axis=0)
+        self.centre_m = np.round((self._low + self._high) / 2)
+        shared: tuple[_Tree, ...] = ()
+        if onto is not None and (onto.centre_m == self.centre_m).all():
+            shared, meshes = onto._trees, meshes[onto.n_meshes :]
+        own = (self._build(meshes, self.n_meshes - len(meshes)),) if meshes else ()
+        self._trees: tuple[_Tree, ...] = (*shared, *own)
+
+    def _build(self, meshes: Sequence[Mesh], first: int) -> _Tree:
+        scene = EmbreeScene()
+        geoms = [TriangleMesh(scene, (mesh.vertices - self.centre_m).astype(np.float32), mesh.faces) for mesh in meshes]
         # Embree builds the scene at its first use, which must not happen in two threads at once.
-        self.cast(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))
+        scene.run(np.zeros((1, 3), np.float32), np.array([[0.0, 0.0, 1.0]], np.float32))
+        return _Tree(scene, geoms, first)
 
     def cast(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Float32Array, Int32Array, Float32Array]:
         """Return the first hit of each ray; safe to call from several threads.
@@ -86,7 +115,7 @@ class Caster(RayCaster):
     ) -> tuple[Float32Array, Int32Array, Float32Array]:
         """Return the results of `cast` for contiguous (N, 3) rays whose origins are given from `centre_m`."""
         # Written with few passes over memory for speed.
-        answer = self._scene.run(origins, directions, output=1)
+        answer = self._run(origins, directions)
         ranges_m, ids, normals = answer["tfar"], answer["geomID"], answer["Ng"]
         products = normals * directions
         cosines = _row_sums(products)
@@ -103,7 +132,7 @@ class Caster(RayCaster):
 
     def hits(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Float32Array, Int32Array, Float32Array]:
         """Return distances and mesh numbers as `cast` does, and the (N, 3) unit normals (0 for a miss)."""
-        answer = self._scene.run(*self._rays(origins, directions), output=1)
+        answer = self._run(*self._rays(origins, directions))
         ids = answer["geomID"]
         is_hit = ids >= 0
         normals = answer["Ng"]
@@ -113,11 +142,24 @@ class Caster(RayCaster):
 
     def faces(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Float32Array, Int32Array, Int32Array]:
         """Return distances and mesh numbers as `cast` does, and the (N,) number of the face hit in its mesh, or -1."""
-        answer = self._scene.run(*self._rays(origins, directions), output=1)
+        answer = self._run(*self._rays(origins, directions))
         ids = answer["geomID"]
         is_hit = ids >= 0
         face = np.where(is_hit, answer["primID"], -1).astype(np.int32)
         return np.where(is_hit, answer["tfar"], np.float32(np.inf)), ids, face
+
+    def _run(self, origins: Float32Array, directions: Float32Array) -> dict[str, npt.NDArray[Any]]:
+        """Return Embree's answer for the nearest hit of each ray in all trees, under the numbers of the meshes."""
+        base, *others = self._trees
+        answer: dict[str, npt.NDArray[Any]] = base.scene.run(origins, directions, output=1)
+        for tree in others:
+            nearer = tree.scene.run(origins, directions, answer["tfar"], output=1)
+            met = np.flatnonzero(nearer["geomID"] >= 0)
+            if len(met):
+                nearer["geomID"] += np.int32(tree.first)
+                for name in ("tfar", "geomID", "primID", "Ng"):
+                    answer[name][met] = nearer[name][met]
+        return answer
 
     def _rays(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Float32Array, Float32Array]:
         """Return origins, from the centre of the scene, and directions, both (N, 3) contiguous."""

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray, Float64Array, transform
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, transform
 from cdpipe.core.voxel import thin
 from sim.geometry.mesh import Mesh, join_meshes, move_mesh, split_triangles
 from sim.geometry.raycast import Caster
@@ -86,11 +86,21 @@ def find_way_out(
 
 def _is_inside(points: Float64Array, caster: Caster, is_solid_inside: bool) -> BoolArray:
     tells = _TELLTALES / np.linalg.norm(_TELLTALES, axis=1, keepdims=True)
+    majority = len(tells) // 2 + 1
+    votes = _count_votes(points, tells[:majority], caster, is_solid_inside)
+    # Where these agree, the others change nothing; that is nearly everywhere.
+    unsure = np.flatnonzero((votes > 0) & (votes < majority))
+    if len(unsure):
+        votes[unsure] += _count_votes(points[unsure], tells[majority:], caster, is_solid_inside)
+    return np.asarray(votes >= majority)
+
+
+def _count_votes(points: Float64Array, tells: Float64Array, caster: Caster, is_solid_inside: bool) -> Int64Array:
+    """Return how many of the rays (K, 3) from each point (N, 3) tell that it is inside."""
     directions = np.repeat(tells, len(points), axis=0)
     _, _, normals = caster.hits(np.tile(points, (len(tells), 1)), directions)
     facing = (normals * directions).sum(axis=1).reshape(len(tells), -1)
-    votes = (facing > 0).sum(axis=0) if is_solid_inside else (facing >= 0).sum(axis=0)
-    return np.asarray(votes > len(tells) / 2)
+    return np.asarray((facing > 0 if is_solid_inside else facing >= 0).sum(axis=0))
 
 
 def _directions() -> Float64Array:

@@ -20,7 +20,7 @@ Posture = Literal["upright", "tipped", "leaning"]
 WALL_GAP_M = 0.05
 # Rays down to the floor start this far above the centreline, below any roof and above any bump.
 PROBE_UP_M = 1.2
-_REMEMBERED = 128  # shapes whose corners are asked for again and again
+_REMEMBERED = 128  # shapes and props whose corners are asked for again and again; their arrays cannot be written
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,12 +108,15 @@ def free_width(
     return reach[0], reach[1]
 
 
+@lru_cache(maxsize=_REMEMBERED)
 def standing_points(standing: Standing) -> Float64Array:
     """Return the corners (N, 3) of a standing prop's surface, world frame; without those set into the floor."""
     local = corners_object(standing.shape)
     if not standing.shape.is_settled:
         local = local[local[:, 2] >= -0.05]
-    return transform(standing.world_T_object, local)
+    points = transform(standing.world_T_object, local)
+    points.setflags(write=False)
+    return points
 
 
 def standing_box(standing: Standing) -> tuple[Float64Array, Float64Array]:
@@ -128,17 +131,21 @@ def standing_middle(standing: Standing) -> Float64Array:
     return np.asarray((low + high) / 2)
 
 
+@lru_cache(maxsize=_REMEMBERED)
 def standing_corners(standing: Standing) -> Float64Array:
     """Return the corners (4, 2) of a standing prop's bounding rectangle on the floor, world frame.
 
     The rectangle keeps the object's own direction; of a prop that lies or leans it is that of what is seen from above.
     """
     pose = standing.world_T_object
-    if standing.posture == "upright":
-        return np.asarray(footprint_corners(standing.shape.size_m) @ pose[:2, :2].T + pose[:2, 3])
-    return bounding_rectangle(standing)
+    if standing.posture != "upright":
+        return bounding_rectangle(standing)
+    corners = np.asarray(footprint_corners(standing.shape.size_m) @ pose[:2, :2].T + pose[:2, 3])
+    corners.setflags(write=False)
+    return corners
 
 
+@lru_cache(maxsize=_REMEMBERED)
 def bounding_rectangle(standing: Standing) -> Float64Array:
     """Return the corners (4, 2) of the rectangle about all of a prop as it tilts on its floor, world frame."""
     pose = standing.world_T_object
@@ -149,7 +156,9 @@ def bounding_rectangle(standing: Standing) -> Float64Array:
     points = standing_points(standing)[:, :2] @ frame.T
     low, high = points.min(axis=0), points.max(axis=0)
     rectangle = np.array([[high[0], high[1]], [low[0], high[1]], [low[0], low[1]], [high[0], low[1]]])
-    return np.asarray(rectangle @ frame)
+    corners = np.asarray(rectangle @ frame)
+    corners.setflags(write=False)
+    return corners
 
 
 def standing_height_m(standing: Standing) -> float:

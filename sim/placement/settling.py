@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import mujoco
@@ -81,7 +82,14 @@ def add_solid(
 
 def quaternion(pose: Float64Array) -> Float64Array:
     """Return a pose's rotation as MuJoCo writes it: w, x, y, z."""
-    return np.asarray(Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True))
+    return np.array(_remember_quaternion(np.ascontiguousarray(pose[:3, :3], np.float64).tobytes()))
+
+
+@lru_cache(maxsize=512)
+def _remember_quaternion(rotation: bytes) -> tuple[float, ...]:
+    """Return the quaternion of a matrix (3, 3) of float64: most solids of a prop share their rotation with others."""
+    matrix = np.frombuffer(rotation).reshape(3, 3)
+    return tuple(Rotation.from_matrix(matrix).as_quat(scalar_first=True).tolist())
 
 
 def _model(item: Standing, points: Float64Array, around: Surroundings) -> mujoco.MjModel:

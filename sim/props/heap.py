@@ -93,7 +93,7 @@ def build_heap(size_m: Size, repose_deg: float, fragment_m: float, is_banked: bo
 
 def whole_mesh(heap: Heap) -> Mesh:
     """Return the surface of a pile: a closed bed and closed fragments, all facing outwards."""
-    return join_meshes([bed_mesh(heap.bed), *heap.rubble.fragments])
+    return join_meshes([bed_mesh(heap.bed), heap.rubble.surface()])
 
 
 def column_volume_m3(mesh: Mesh, size_m: Size, columns: int = 60_000) -> float:

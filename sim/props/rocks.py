@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, stream
+from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, Int64Array, stream
 from sim.geometry.mesh import Mesh
 from sim.props.parts import hull_mesh
 
@@ -100,20 +100,46 @@ def _chip(points: Float64Array, faces: Int32Array, generator: np.random.Generato
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rubble:
-    """Fragments, each a closed surface that faces outwards.
+    """Fragments, each a closed surface that faces outwards; a pile has hundreds, so they share their arrays.
 
     Attributes:
-        fragments: N surfaces, metres.
+        vertices: (V, 3) corners, fragment by fragment, metres.
+        faces: (F, 3) int32, fragment by fragment, numbered from the first corner of their own fragment.
+        n_vertices, n_faces: (N,) number of corners and faces of each fragment.
         centres: (N, 3) middle of each, metres.
     """
 
-    fragments: tuple[Mesh, ...]
+    vertices: Float64Array
+    faces: Int32Array
+    n_vertices: Int64Array
+    n_faces: Int64Array
     centres: Float64Array
+
+    @property
+    def starts(self) -> Int64Array:
+        """(N,) number of the first corner of each fragment."""
+        return np.cumsum(self.n_vertices) - self.n_vertices
+
+    @property
+    def fragments(self) -> tuple[Mesh, ...]:
+        """The fragments one by one."""
+        corners, faces = np.cumsum(self.n_vertices)[:-1], np.cumsum(self.n_faces)[:-1]
+        return tuple(map(Mesh, np.split(self.vertices, corners), np.split(self.faces, faces))) if len(self) else ()
+
+    def __len__(self) -> int:
+        """Return the number of fragments."""
+        return len(self.centres)
+
+    def surface(self) -> Mesh:
+        """Return all fragments as one mesh."""
+        starts = np.repeat(self.starts, self.n_faces)
+        return Mesh(self.vertices, (self.faces + starts[:, None]).astype(np.int32))
 
     def kept(self, is_kept: BoolArray) -> Rubble:
         """Return the fragments marked (N,)."""
-        numbers = np.flatnonzero(is_kept)
-        return Rubble(tuple(self.fragments[number] for number in numbers), self.centres[is_kept])
+        vertices = self.vertices[np.repeat(is_kept, self.n_vertices)]
+        faces = self.faces[np.repeat(is_kept, self.n_faces)]
+        return Rubble(vertices, faces, self.n_vertices[is_kept], self.n_faces[is_kept], self.centres[is_kept])
 
 
 def draw_sizes(
@@ -167,32 +193,40 @@ def lay_fragments(
     which = generator.integers(_TEMPLATES, size=n)
     depth = generator.uniform(*buried, n) * sizes_m
     centres = np.column_stack([xy, heights(xy)]) + depth[:, None] * _normals(xy, heights)
-    fragments = tuple(
-        Mesh(templates[pick].vertices @ (size * turn).T + centre, templates[pick].faces)
+    vertices = [
+        templates[pick].vertices @ (size * turn).T + centre
         for pick, size, turn, centre in zip(which, sizes_m, turns, centres, strict=True)
+    ]
+    faces = [templates[pick].faces for pick in which]
+    n_vertices, n_faces = (np.array([len(each) for each in part], np.int64) for part in (vertices, faces))
+    none = np.empty((0, 3))
+    return Rubble(
+        np.concatenate([none, *vertices]),
+        np.concatenate([none.astype(np.int32), *faces]),
+        n_vertices,
+        n_faces,
+        centres,
     )
-    return Rubble(fragments, centres)
 
 
 def confine(rubble: Rubble, low: Float64Array, high: Float64Array) -> Rubble:
     """Move every fragment that reaches out of a box, from corner (3,) to corner (3,), infinite or not, back into it."""
-    over_m = [
-        np.maximum(low - each.vertices.min(axis=0), 0) - np.maximum(each.vertices.max(axis=0) - high, 0)
-        for each in rubble.fragments
-    ]
-    return shift_rubble(rubble, np.reshape(over_m, (-1, 3)))
+    if not len(rubble):
+        return rubble
+    lowest, highest = (part.reduceat(rubble.vertices, rubble.starts, axis=0) for part in (np.minimum, np.maximum))
+    return shift_rubble(rubble, np.maximum(low - lowest, 0) - np.maximum(highest - high, 0))
 
 
 def shift_rubble(rubble: Rubble, shift_m: Float64Array) -> Rubble:
     """Return the fragments shifted by one vector (3,), or by one each (N, 3)."""
     shifts_m = np.broadcast_to(shift_m, rubble.centres.shape)
-    moved = (Mesh(each.vertices + by_m, each.faces) for each, by_m in zip(rubble.fragments, shifts_m, strict=True))
-    return Rubble(tuple(moved), rubble.centres + shifts_m)
+    vertices = rubble.vertices + np.repeat(shifts_m, rubble.n_vertices, axis=0)
+    return replace(rubble, vertices=vertices, centres=rubble.centres + shifts_m)
 
 
 def join_rubble(first: Rubble, second: Rubble) -> Rubble:
     """Return the fragments of both."""
-    return Rubble((*first.fragments, *second.fragments), np.concatenate([first.centres, second.centres]))
+    return Rubble(*(np.concatenate([getattr(first, each.name), getattr(second, each.name)]) for each in fields(Rubble)))
 
 
 def _normals(xy: Float64Array, heights: Heights, step_m: float = 0.1) -> Float64Array:

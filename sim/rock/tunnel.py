@@ -13,6 +13,7 @@ from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, Int64Array
 from scenarios.schema import Tunnel
 from sim.geometry.mesh import Mesh, drop_flat_faces, drop_unused_vertices
+from sim.geometry.rows import number_rows, unique_rows
 from sim.rock.centreline import Centreline
 from sim.rock.field import Field
 
@@ -37,8 +38,8 @@ def mesh_tunnel(tunnel: Tunnel, centreline: Centreline, seed: int) -> Mesh:
     vertices = np.concatenate([piece[1] for piece in pieces])
     counts = np.cumsum([0] + [len(piece[0]) for piece in pieces])
     faces = np.concatenate([piece[2] + start for piece, start in zip(pieces, counts[:-1], strict=True)])
-    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    return _drop_small_parts(vertices[first], drop_flat_faces(inverse.reshape(-1)[faces]))
+    _, first, inverse = np.unique(number_rows(keys), return_index=True, return_inverse=True)
+    return _drop_small_parts(vertices[first], drop_flat_faces(inverse[faces]))
 
 
 def _block_meshes(
@@ -74,10 +75,10 @@ def _blocks_near(centreline: Centreline, field: Field, cell_m: float) -> Int64Ar
     found = []
     for line, frame in zip(centreline.drifts, field.frames, strict=True):
         reach = int(np.ceil(frame.reach_m / size_m))
-        home = np.unique(np.floor(line.points[:, :2] / size_m).astype(np.int64), axis=0)
+        home = unique_rows(np.floor(line.points[:, :2] / size_m).astype(np.int64))
         shifts = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
         found.append((home[:, None] + shifts).reshape(-1, 2))
-    return np.unique(np.concatenate(found), axis=0)
+    return unique_rows(np.concatenate(found))
 
 
 def _drop_small_parts(vertices: Float64Array, faces: Int64Array) -> Mesh:

@@ -207,8 +207,8 @@ def _tally_reshaped(change_id: int, instance: int, start: Standing, end: Standin
     the removed part comes from outside and meets it, because the rest of the pile still stands behind its rim.
     """
     full, rest = (_compact(_surface_in(scene, instance)) for scene in (world.before, world.after))
-    near_full, near_rest = _samples(full), _samples(rest)
-    is_gone = np.asarray(near_rest.query(full.vertices[full.faces].mean(axis=1))[0] > NEAR_OLD_SURFACE_M)
+    near_full, near_rest = SampledSurface(full), SampledSurface(rest)
+    is_gone = near_rest.lies_off(full.vertices[full.faces].mean(axis=1), NEAR_OLD_SURFACE_M)
     skin = drop_unused_vertices(full.vertices, full.faces[is_gone])
     # The part removed lies between the old skin and the new face below it.
     floor_m = start.world_T_object[2, 3]
@@ -225,16 +225,43 @@ def _tally_reshaped(change_id: int, instance: int, start: Standing, end: Standin
     return tally
 
 
-def _corners_off(mesh: Mesh, other: cKDTree, floor_m: float) -> Float64Array:
+def _corners_off(mesh: Mesh, other: SampledSurface, floor_m: float) -> Float64Array:
     """Return the corners (N, 3) of a surface above the floor that lie off the samples of another one."""
     corners = mesh.vertices[mesh.vertices[:, 2] >= floor_m]
-    return np.asarray(corners[other.query(corners)[0] > _SAME_SURFACE_M])
+    return corners[other.lies_off(corners, _SAME_SURFACE_M)]
 
 
-def _samples(mesh: Mesh) -> cKDTree:
-    """Sample a surface so that every place on it has a sample within 1.8 cm: distances of 0.1 m are exact to 2 mm."""
-    middles = split_triangles(mesh.vertices[mesh.faces], _SAMPLE_M).mean(axis=1)
-    return cKDTree(np.concatenate([mesh.vertices, middles]), balanced_tree=False, compact_nodes=False)
+class SampledSurface:
+    """Samples of a surface: its corners, and others so that every place on it has one within 1.8 cm.
+
+    Distances of 0.1 m are exact to 2 mm. Only the parts near points that lie off all corners are ever sampled.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        self._corners = _tree(mesh.vertices)
+        self._triangles = mesh.vertices[mesh.faces]
+        self._middles = self._triangles.mean(axis=1)
+        self._reach_m = np.linalg.norm(self._triangles - self._middles[:, None], axis=2).max(axis=1)
+
+    def lies_off(self, points: Float64Array, limit_m: float) -> BoolArray:
+        """Mark the points (N, 3) that are farther than `limit_m` from every sample."""
+        nearest_m, _ = self._corners.query(points, distance_upper_bound=2 * limit_m)
+        is_off = np.logical_not(np.asarray(nearest_m) <= limit_m)
+        unsure = np.flatnonzero(is_off)
+        if not len(unsure):
+            return is_off
+        # No sample of a triangle is farther from its middle than a corner is.
+        apart_m, _ = _tree(points[unsure]).query(self._middles)
+        near = self._triangles[apart_m <= self._reach_m + limit_m + _SLACK_M]
+        a, b, c = split_triangles(near, _SAMPLE_M).transpose(1, 0, 2)
+        if len(a):
+            nearest_m, _ = _tree((a + b + c) / 3).query(points[unsure], distance_upper_bound=2 * limit_m)
+            is_off[unsure] = np.logical_not(np.asarray(nearest_m) <= limit_m)
+        return is_off
+
+
+def _tree(points: Float64Array) -> cKDTree:
+    return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
 def _surface_in(scene: Scene, instance: int) -> Mesh:

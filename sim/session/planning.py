@@ -61,8 +61,12 @@ def plan_drives(scenario: Scenario, seed: int, sensor: SensorMetadata | None = N
         InputError: A trajectory cannot be read.
         ScenarioError: The world contradicts itself, or a mover finds no way.
     """
+    return plan_drives_in(build_world(scenario, seed), scenario, seed, sensor)
+
+
+def plan_drives_in(world: World, scenario: Scenario, seed: int, sensor: SensorMetadata | None = None) -> list[Drive]:
+    """Plan both sessions in their world, see `plan_drives`."""
     sensors = {name: sensor or load_sensor(scenario, name) for name in SESSIONS}
-    world = build_world(scenario, seed)
     tallies = list_changes(scenario, world)
     trajectories = {name: plan_trajectory(world, scenario, sensors[name], seed, name) for name in SESSIONS}
     movers = plan_movers(world, scenario, {name: each.true for name, each in trajectories.items()}, seed)

@@ -330,11 +330,12 @@ def simulate_in_memory(scenario: Scenario, seed: int, n_threads: int = 1) -> Hel
     """
     drives, files = _plan(scenario, seed, _report_nothing)
     with ThreadPoolExecutor(min(n_threads, os.cpu_count() or 1)) as pool:
-        sessions = {drive.name: _hold_session(drive, pool) for drive in drives}
+        sessions = {drive.name: hold_session(drive, pool) for drive in drives}
     return HeldPair(collect_truth(scenario, seed, drives, files), sessions)
 
 
-def _hold_session(drive: Drive, pool: Executor) -> LabelledSession:
+def hold_session(drive: Drive, pool: Executor) -> LabelledSession:
+    """Simulate one session with its truth into memory, the revolutions in the threads of `pool`."""
     with closing(_simulate_revolutions(drive, pool)) as revolutions:
         drive, kept = _estimate_odometry(drive, revolutions, _report_nothing)
         chunk, instance, change, surface = zip(*_fill_chunks(drive, kept), strict=True)

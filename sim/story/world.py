@@ -17,7 +17,8 @@ from sim.geometry.raycast import Caster
 from sim.movers.planning import plan_movers
 from sim.placement.placing import Standing
 from sim.placement.puddles import lay_puddles
-from sim.scene import HEAP_M, Ground, Heaps, World, compile_moved, compile_scene, follow_rock
+from sim.rock.centreline import Centreline
+from sim.scene import HEAP_M, Ground, Heaps, World, compile_moved, compile_prop, compile_scene, follow_rock
 from sim.session.planning import PlannedSession
 from sim.story.schedule import stands_in
 from sim.story.state import SessionState
@@ -55,7 +56,7 @@ def build_session_world(scenario: Scenario, ground: Ground, state: SessionState)
         told = level, bare, *follow_rock(moved, bare, ground.fixtures)
         items, rock = carry(items, moved), compile_moved(ground, wall, told[3])
         heaps = tuple(rubble_points(moved, HEAP_M))
-    scene = compile_scene(scenario, rock, told[3], items, "after")
+    scene = compile_scene(scenario, rock, told[3], {item: compile_prop(item) for item in items}, "after")
     here = tuple(replace(item, sessions=frozenset({state.name})) for item in items)
     return World(*told, here, scene, scene, heaps=heaps)
 
@@ -73,15 +74,34 @@ def plan_session(scenario: Scenario, ground: Ground, world: World, state: Sessio
         InputError: The sensor profile or a trajectory cannot be read.
         ScenarioError: The drive or a mover finds no way.
     """
-    name = state.name
+    return plan_alone(scenario, ground.centreline, world, (state.name, state.plan), seed)
+
+
+def plan_alone(
+    scenario: Scenario, centreline: Centreline, world: World, session: tuple[str, str], seed: int
+) -> PlannedSession:
+    """Plan the drive of a session under a name of its own, which keys every draw.
+
+    Args:
+        scenario: The scenario as drawn.
+        centreline: The drifts, by which puddles are laid.
+        world: The session's world; both of its scenes are the session's.
+        session: Its name, and the session of the scenario whose drive it takes.
+        seed: Draws everything the scenario leaves open.
+
+    Raises:
+        InputError: The sensor profile or a trajectory cannot be read.
+        ScenarioError: The drive or a mover finds no way.
+    """
+    name, plan = session
     values = {field: getattr(scenario, field) for field in Scenario.model_fields}
     for part in ("movers", "puddles"):
-        values[part] = tuple(_give(item, state.plan) for item in values[part])
-    own = OneSession.model_construct(**values, own=scenario.plan(state.plan))
+        values[part] = tuple(_give(item, plan) for item in values[part])
+    own = OneSession.model_construct(**values, own=scenario.plan(plan))
     sensor = load_sensor(own, name)
     trajectory = plan_trajectory(world, own, sensor, seed, name)
     movers = plan_movers(world, own, {name: trajectory.true}, seed)[name]
-    pools = lay_puddles(own, ground.centreline, world.walls, name, seed)
+    pools = lay_puddles(own, centreline, world.walls, name, seed)
     return PlannedSession(own.of(name), world.before, sensor, trajectory, movers, pools, seed, name)
 
 

@@ -1,6 +1,6 @@
 """The page of one answer: what changed in one sentence, the pair in 3-D, and its objects. One file, no network.
 
-The page draws points itself with WebGL (`answer.js`): plotly.js alone would be as large as a page may be.
+The page draws points itself with WebGL (`answer.js`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from eval.core.figures import blank_figure, data_address
 from eval.report.answer.content import AnswerContent
 from eval.report.answer.layers import Layer, list_layers, pack
 from eval.report.answer.tables import object_place, tabulate_objects, tabulate_regions, tabulate_rock
-from eval.report.charts import script_json
+from eval.report.drawing.charts import script_json
 from eval.report.maps import style_map_axes
 from eval.report.render import render_page, write_file
 from eval.report.tables import Cell, Table

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from eval.core.figures import picture_address
 from eval.plans.targets import is_oracle, read_targets
+from eval.report.drawing.charts import Chart
 from eval.report.merge.cases import MAX_ROWS, Case, case_table, distinct_cases, draw_case, read_case
 from eval.report.merge.charts import error_chart, time_chart
 from eval.report.merge.tables import families_table, kinds_table, refusals_table, stated_seconds, times_table
-from eval.report.tables import Picture, Section, Table, with_rows
+from eval.report.tables import Section, Table, with_rows
 from eval.running.run_data import RunData, covered_by, ends_at_merge, repeats, shown_variant, text
 from eval.tables.merge_table import EXACT_M, RIGHT_DEG, RIGHT_M, RULES, TIMES, is_within_target, kinds, merge_table
 from eval.tables.rows import numbers
@@ -45,22 +45,24 @@ def draw_merge(data: RunData) -> Section:
     )  # fmt: skip
 
 
-def _plots(results: pd.DataFrame) -> list[Picture]:
+def _plots(results: pd.DataFrame) -> list[Chart]:
     """Draw errors and times of every variant that does not merge by the truth."""
     own = results[[not is_oracle(str(name)) for name in results["variant"]]]
     if len(own) == 0:
         return []
-    errors = Picture(
+    errors = Chart(
+        "merge_errors",
         "Merge error against the true overlap",
-        picture_address(error_chart(own)),
+        error_chart(own),
         f"One mark per pair: dots were accepted, crosses not. Dashed: {EXACT_M:g} m, the target of clean pairs; solid: "
         f"{RIGHT_M:g} m, above which an accepted merge is wrong. Errors below 0.1 mm stand at 0.1 mm.",
     )
     if not any(len(stated_seconds(own, column)) for column in TIMES):
         return [errors]
-    times = Picture(
+    times = Chart(
+        "merge_times",
         "Time of the merge",
-        picture_address(time_chart(own)),
+        time_chart(own),
         "One dot per accepted pair (n of them; refused ones state no time), a bar at the median, logarithmic; one "
         "thread. Indexing can be done while mapping.",
     )

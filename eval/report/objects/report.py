@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
 from eval.core.charts import Axis, Drawing, Look, Panel, Series
 from eval.core.domains import domain_name
-from eval.core.figures import picture_address
+from eval.report.drawing.charts import Chart
+from eval.report.drawing.looks import look_of
 from eval.report.objects.cases import object_cases, voxel_variants
 from eval.report.objects.tables import OBJECT_COLUMNS, OBJECT_COUNTS, WITHDRAWAL_COLUMNS, groups_table
-from eval.report.regions.charts import look_of
-from eval.report.tables import Picture, Section, conditions_table, methods_table, targets_table, with_rows
+from eval.report.tables import Section, conditions_table, methods_table, targets_table, with_rows
 from eval.running.run_data import RunData, every_condition, off_grids, shown_variant, stored_table
 from eval.running.runfolder import reported
 from eval.tables.columns import select
@@ -53,7 +52,7 @@ def draw_objects(data: RunData) -> Section | None:
     return Section(with_rows(tables), plots, pictures=tuple(pictures), missing=tuple(missing))
 
 
-def _size_plot(groups: pd.DataFrame, data: RunData, main: str) -> Picture:
+def _size_plot(groups: pd.DataFrame, data: RunData, main: str) -> Chart:
     """Draw the IoU of every object of the main variant and the means of all variants over the volume of the hull."""
     names = [main, *(str(name) for name in groups["variant"].unique() if name != main)]
     domains = with_domain(data.results).drop_duplicates("scenario").set_index("scenario")["domain"]
@@ -69,9 +68,10 @@ def _size_plot(groups: pd.DataFrame, data: RunData, main: str) -> Picture:
         x = Axis("hull of the object [m³]", (0.8 * _LEAST_M3, 1.25 * _MOST_M3), is_log=True)
         y = Axis("" if panels else "point IoU", (-0.03, 1.03))
         panels.append(Panel(x, y, [dots, *lines], f"{domain_name(domain)}, {len(own)} objects"))
-    return Picture(
+    return Chart(
+        "object_sizes",
         "Point IoU by the size of the object",
-        picture_address(Drawing([panels], 325)),
+        Drawing([panels], 325),
         f"A dot for every observable object, answered by {main}, missed ones at 0; lines: means of each method in bins "
         f"of the hull's volume; bars: 95 % interval over pairs of {main}.",
     )
@@ -84,6 +84,5 @@ def _size_lines(sizes: pd.DataFrame, names: Sequence[str]) -> list[Series]:
         own = sizes[sizes["variant"] == name]
         middles_m3 = np.sqrt(own["low"].clip(0.03, 10.0) * own["high"].clip(0.1, 30.0))
         low, high = (own["iou_point_low"], own["iou_point_high"]) if name == names[0] else (None, None)
-        look = replace(look_of(name, names), marker="circle", size=3.0)
-        lines.append(Series(middles_m3, own["iou_point"], look, name, low=low, high=high))
+        lines.append(Series(middles_m3, own["iou_point"], look_of(name), name, low=low, high=high, hover="IoU {y:.2f}"))
     return [line for line in lines if np.size(line.y)]

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from eval.core.charts import Axis, Drawing, Look, Panel, Series, log_span
+from eval.core.charts import Axis, Drawing, Panel, Series, log_span
 from eval.core.domains import domain_name
-from eval.report.charts import Chart
-from eval.report.regions.charts import look_of
+from eval.report.drawing.charts import Chart
+from eval.report.drawing.looks import look_of
 from eval.report.tables import Cell, Table, best_rows, interval_of_row
 from eval.running.run_data import split_variant
 from eval.tables.columns import Column, share, spaced
@@ -54,7 +53,7 @@ def draw_budgets(budgets: pd.DataFrame) -> Chart | None:
         for price, title in _PRICES.items():
             its = own[(own["price"] == price) & own["recall"].notna()]
             lines = [
-                Series(part["budget"], part["recall"], _dotted(name, names), name, hover="%{x:.3g}: recall %{y:.3f}")
+                Series(part["budget"], part["recall"], look_of(name), name, hover="{x:.3g}: recall {y:.3f}")
                 for name in names
                 if len(part := its[its["variant"] == name])
             ]
@@ -86,10 +85,6 @@ def budget_areas(budgets: pd.DataFrame) -> Table:
             rows.append((domain_name(domain), (Cell(spaced(name)), *cells)))
     caption = "What proposals save: mean recall from no budget to the one in the heading; interval: 95 % over pairs"
     return Table(("method", *_AREAS.values()), tuple(rows), caption)
-
-
-def _dotted(name: str, names: list[str]) -> Look:
-    return replace(look_of(name, names), marker="circle", size=3.0)
 
 
 def _area_cell(row: Mapping[str, Any], *, is_best: bool) -> Cell:

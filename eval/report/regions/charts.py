@@ -9,59 +9,18 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from eval.core.charts import (
-    BLACK,
-    BLUE,
-    GREEN,
-    ORANGE,
-    VERMILLION,
-    Axis,
-    Dash,
-    Drawing,
-    Look,
-    Panel,
-    Series,
-    named_ticks,
-)
+from eval.core.charts import Axis, Drawing, Look, Panel, Series, named_ticks
 from eval.core.domains import domain_name
-from eval.report.charts import Chart
+from eval.report.drawing.charts import Chart
+from eval.report.drawing.looks import line_of, look_of
 from eval.tables.columns import EN_DASH, share
 from eval.tables.region_curves import RATES_PER_100M
 from eval.tables.rows import ALL_DOMAINS
 
-_SKY, _PURPLE, _GREY, _TEAL, _WINE = "#56B4E9", "#CC79A7", "#8a8a8a", "#44AA99", "#882255"
-_LOOKS = {
-    "tunnelcd": Look(BLACK, 2.2),
-    "voxel-diff": Look(ORANGE, 1.6),
-    "c2c": Look(VERMILLION, 1.6),
-    "sphere-difference": Look(GREEN, 1.6),
-    "paper": Look(BLUE),
-    "paper-paired": Look(BLUE, dash="dash"),
-    "paper-topn": Look(BLUE, dash="dashdot"),
-    "m3c2": Look(_TEAL, 1.6),
-    "m3c2-ep": Look(_TEAL, 1.6, "dash"),
-    "dufomap": Look(_WINE, 1.6),
-    "octomap": Look(_WINE, 1.6, "dash"),
-    "removert": Look(_WINE, 1.6, "dashdot"),
-    "erasor": Look(_GREY, 1.6, "dash"),
-    "range-net": Look(_SKY, 1.6),
-    "scan-context": Look(_PURPLE, 1.2),
-    "solid": Look(_PURPLE, 1.2, "dash"),
-    "untrained": Look(_SKY, 1.2),
-    "random-regions": Look(_GREY, 1.2, "dot"),
-}
-_DASHES: tuple[Dash, ...] = ("dashdot", "dot")
-_OTHERS = tuple(Look(colour, 1.2, dash) for dash in _DASHES for colour in (BLUE, ORANGE, GREEN, VERMILLION, _PURPLE))
 _FAINT, _LIMIT = Look("#d0d0d0", 0.8), Look("#c4c4c4", 0.8)
 _LEAST_RATE, _MOST_RATE = 0.01, 10.0
 _MEASURES = {"hull_volume_m3": "hull of the object [m³]", "n_returns": "returns", "range_m": "shortest range [m]"}
 _MAX_LINES = 5
-
-
-def look_of(name: str, names: Sequence[str]) -> Look:
-    """Return the look of a method: its own, or one of a few in the order of `names`."""
-    unknown = [each for each in names if each not in _LOOKS]
-    return _LOOKS[name] if name in _LOOKS else _OTHERS[unknown.index(name) % len(_OTHERS)]
 
 
 def draw_roc(curves: pd.DataFrame, table: pd.DataFrame, main: str) -> Chart | None:
@@ -77,8 +36,8 @@ def draw_roc(curves: pd.DataFrame, table: pd.DataFrame, main: str) -> Chart | No
     told = []
     for domain, methods in _domains(curves):
         lines = [
-            Series(own["false_positive_rate"], own["true_positive_rate"], look_of(method, list(methods)), method,
-                   hover="%{x:.3f} of the unchanged, %{y:.3f} of the changed keyframes")
+            Series(own["false_positive_rate"], own["true_positive_rate"], line_of(method), method,
+                   hover="{x:.3f} of the unchanged, {y:.3f} of the changed keyframes")
             for method, own in methods.items()
         ]  # fmt: skip
         x = Axis("false positive rate (keyframes far from any change)", (0.0, 1.0))
@@ -107,7 +66,7 @@ def draw_free_response(curves: pd.DataFrame, table: pd.DataFrame) -> Chart | Non
     for domain, methods in _domains(curves):
         series = [Series([rate, rate], [0.0, 1.03], _LIMIT) for rate in RATES_PER_100M]
         for name, curve in methods.items():
-            look, hover = look_of(name, list(methods)), "%{x:.3g} false regions per 100 m, recall %{y:.3f}"
+            look, hover = line_of(name), "{x:.3g} false regions per 100 m, recall {y:.3f}"
             x = np.append(curve["false_regions_per_100m"], _MOST_RATE).clip(_LEAST_RATE, _MOST_RATE)
             y = np.append(curve["recall"], curve["recall"].iloc[-1])
             series.append(Series(x, y, look, name, "steps", hover=hover))
@@ -115,7 +74,7 @@ def draw_free_response(curves: pd.DataFrame, table: pd.DataFrame) -> Chart | Non
             own = own[own["false_regions_per_100m"].notna()]
             if len(own):
                 at = own["false_regions_per_100m"].clip(_LEAST_RATE, _MOST_RATE)
-                dot = replace(look, width=0.0, marker="circle")
+                dot = replace(look_of(name), width=0.0)
                 series.append(Series(at, own["recall"], dot, name, hover=hover))
         x_axis = Axis("false regions per 100 m", (0.93 * _LEAST_RATE, _MOST_RATE), is_log=True)
         y_axis = Axis("" if panels else "recall of observable changes", (0.0, 1.03))
@@ -164,8 +123,7 @@ def _size_panel(bins: Mapping[str, pd.DataFrame], title: str, y_title: str) -> P
         # side by side, so that equal values do not hide each other
         x = np.array([lows.index(low) for low in own["low"]]) + 0.07 * (place - (len(bins) - 1) / 2)
         low, high = (own["interval_low"], own["interval_high"]) if name == list(bins)[-1] else (None, None)
-        look = replace(look_of(name, list(bins)), marker="circle", size=3.5)
-        series.append(Series(x, own["recall_at_rate"], look, name, low=low, high=high, hover="recall %{y:.2f}"))
+        series.append(Series(x, own["recall_at_rate"], look_of(name), name, low=low, high=high, hover="recall {y:.2f}"))
     every = pd.concat(bins.values()).drop_duplicates("low").sort_values("low")
     names = [
         f"{f'≥{low:g}' if math.isinf(high) else f'<{high:g}' if low == 0 else f'{low:g}{EN_DASH}{high:g}'}\nn {n}"

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from eval.core.charts import BLACK, COLOURS, SYMBOLS, Axis, Drawing, Look, Panel, Series
-from eval.core.figures import picture_address
+from eval.core.charts import BLACK, Axis, Drawing, Look, Panel, Series
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.worlds import get_group
-from eval.report.tables import Cell, Picture, Table
+from eval.report.drawing.charts import Chart
+from eval.report.drawing.looks import look_of
+from eval.report.tables import Cell, Table
 from eval.running.run_data import RunData, of, over_pairs
 from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, Column, count, select, share
 from eval.tables.effects import effects
@@ -34,11 +35,11 @@ _ZERO = Look(BLACK, 0.8)
 
 @dataclass(frozen=True, slots=True)
 class EffectsOn:
-    """What the settings over one world do; no picture where neither recall nor IoU is defined."""
+    """What the settings over one world do; no chart where neither recall nor IoU is defined."""
 
     reference: str
     table: Table
-    picture: Picture | None
+    chart: Chart | None
 
 
 def draw_effects(data: RunData) -> list[EffectsOn]:
@@ -46,7 +47,7 @@ def draw_effects(data: RunData) -> list[EffectsOn]:
     results = pd.DataFrame(list(data.every_result))
     known = [name for name in ("scenario", "seed", "variant", *(column.key for column in COLUMNS)) if name in results]
     found = effects(results[known]).groupby("reference", sort=False)
-    return [_effects_on(data, str(reference), own) for reference, own in found]
+    return [_effects_on(data, str(reference), own, place) for place, (reference, own) in enumerate(found, 1)]
 
 
 def signed(column: Column, value: float) -> str:
@@ -65,12 +66,13 @@ def shorten(settings: Sequence[str]) -> tuple[str, list[str]]:
     return group, [", ".join(part.removeprefix(f"{group}.") for part in text.split(",")) for text in settings]
 
 
-def effect_chart(panels: Mapping[str, pd.DataFrame]) -> Drawing:
+def effect_chart(panels: Mapping[str, pd.DataFrame], look: Callable[[str], Look] = look_of) -> Drawing:
     """Draw one panel for each figure: settings from top to bottom, a dot and a line for each variant.
 
     Args:
         panels: By the name of the figure, a row for each effect on it: `setting`, `variant`, `difference` and its
             interval `low` to `high`, NaN where undefined; settings and variants in the order in which they come.
+        look: How a variant is drawn.
     """
     every = pd.concat(panels.values())
     settings, variants = (list(every[name].unique()) for name in ("setting", "variant"))
@@ -86,15 +88,15 @@ def effect_chart(panels: Mapping[str, pd.DataFrame]) -> Drawing:
         for order, variant in enumerate(variants):
             own = table[table["variant"] == variant]
             places = own["setting"].map(middles) + (order - (len(variants) - 1) / 2) * step
-            look = Look(COLOURS[(order + 1) % len(COLOURS)], 0.0, marker=SYMBOLS[order % len(SYMBOLS)], size=4.5)
+            dots = replace(look(variant), width=0.0)
             ends = {"low": own["low"], "high": own["high"]}
-            series.append(Series(own["difference"], places.tolist(), look, variant, is_across=True, **ends))
+            series.append(Series(own["difference"], places.tolist(), dots, variant, is_across=True, **ends))
         ticks = {place: "" if row else text for place, text in zip(middles.values(), names, strict=True)}
         row.append(Panel(Axis(f"difference of {figure}"), Axis(span=(bottom, 0.0), ticks=ticks), series))
     return Drawing([row], round(_MARGIN_PX + _ROW_PX * bottom))
 
 
-def _effects_on(data: RunData, reference: str, table: pd.DataFrame) -> EffectsOn:
+def _effects_on(data: RunData, reference: str, table: pd.DataFrame, place: int) -> EffectsOn:
     columns = [column for column in COLUMNS if column.key in set(table["metric"][table["n"] > 0])]
     settings = list(table["settings"].unique())
     group, short = shorten(settings)
@@ -103,7 +105,7 @@ def _effects_on(data: RunData, reference: str, table: pd.DataFrame) -> EffectsOn
     drawn = [column for column in columns if column.key in _DRAWN]
     headings = ("setting", "pairs", *(column.heading for column in columns))
     lines = Table(headings, tuple(_lines(data, table, columns, short)), f"{title}, on average")
-    return EffectsOn(reference, lines, _picture(title, table, drawn) if drawn else None)
+    return EffectsOn(reference, lines, _chart(f"effects_{place}", title, table, drawn) if drawn else None)
 
 
 def _lines(
@@ -128,10 +130,10 @@ def _cell(column: Column, row: Mapping[str, Any]) -> Cell:
     return Cell(signed(column, row["difference"]), is_clear, "" if math.isnan(row["low"]) else f"{low} to {high}")
 
 
-def _picture(title: str, table: pd.DataFrame, columns: Sequence[Column]) -> Picture:
+def _chart(name: str, title: str, table: pd.DataFrame, columns: Sequence[Column]) -> Chart:
     panels = {column.heading: table[table["metric"] == column.key] for column in columns}
     counts = sorted(set(table["n"][table["metric"].isin(_DRAWN)]))
     n = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     pairs = "pair" if n == "1" else "pairs"
     caption = f"Dots are means over {n} session {pairs}, lines their 95 % intervals; right of 0 is better."
-    return Picture(title, picture_address(effect_chart(panels)), caption)
+    return Chart(name, title, effect_chart(panels), caption)

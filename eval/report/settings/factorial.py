@@ -12,7 +12,7 @@ import pandas as pd
 from cdpipe.core.geometry import Float64Array
 from eval.core.charts import Axis, Drawing, Heat, Panel, named_ticks
 from eval.core.domains import domain_name
-from eval.report.charts import Chart, plotly_text
+from eval.report.drawing.charts import Chart
 from eval.report.settings.grids import N_ACROSS, PQ_COLUMN, SHARES
 from eval.running.run_data import RunData, split_variant
 from eval.tables.columns import RESULT_COLUMNS, Column, significant
@@ -113,5 +113,4 @@ def _panel(column: Column, table: Float64Array, sources: list[str], rules: list[
     texts = [[column.shown(value) for value in row] for row in table]
     x = Axis("extraction", (-0.5, len(rules) - 0.5), ticks=named_ticks(rules))
     y = Axis("source", (len(sources) - 0.5, -0.5), ticks=named_ticks(sources))  # the first on top
-    hover = f"{plotly_text(column.heading)}: %{{text}}<extra></extra>"
-    return Panel(x, y, [], column.heading, Heat(table, texts, low, high, hover))
+    return Panel(x, y, [], column.heading, Heat(table, texts, low, high))

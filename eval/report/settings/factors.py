@@ -12,7 +12,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.model.config import load_config
 from eval.core.charts import COLOURS, Axis, Drawing, Look, Panel, Series, named_ticks
 from eval.core.domains import domain_name
-from eval.report.charts import Chart, plotly_text
+from eval.report.drawing.charts import Chart
 from eval.report.settings.grids import N_ACROSS, SHARES
 from eval.running.run_data import (
     Row,
@@ -129,7 +129,7 @@ def _series(factor: Factor, rows: Sequence[Row], key: str, colour: str, domain: 
     means = np.array([over_pairs(group, key) for group in groups])
     low, high = np.array([interval_over_pairs(group, key) for group in groups]).T
     hover = [
-        f"{plotly_text(value)}: {mean:.3g}, n {len(defined(group, key))}"
+        f"{value}: {mean:.3g}, n {len(defined(group, key))}"
         for value, mean, group in zip(factor.points, means, groups, strict=True)
     ]
     places, name = np.arange(len(means)), domain_name(domain)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from eval.core.charts import BLACK, Axis, Drawing, Heat, Look, Panel, Series, named_ticks
-from eval.report.charts import Chart, plotly_text
+from eval.report.drawing.charts import Chart
 from eval.running.run_data import GridOf, RunData, grids, of, over_pairs
 from eval.tables.columns import RESULT_COLUMNS, Column, share
 
@@ -55,9 +55,8 @@ def _drawing(grid: GridOf, tables: Mapping[Column, Any]) -> Drawing:
     for column, table in tables.items():
         low, high = (0.0, 1.0) if column.key in SHARES else (float(np.nanmin(table)), float(np.nanmax(table)))
         texts = [[column.shown(value) for value in row] for row in table]
-        hover = f"{plotly_text(' and '.join(grid.keys))}: %{{text}}<extra></extra>"
         axes = Axis(grid.keys[1], (-0.5, len(x) - 0.5), ticks=x), Axis(grid.keys[0], (-0.5, len(y) - 0.5), ticks=y)
-        panels.append(Panel(*axes, _frames(table, column), column.heading, Heat(table, texts, low, high, hover)))
+        panels.append(Panel(*axes, _frames(table, column), column.heading, Heat(table, texts, low, high)))
     rows = [panels[start : start + N_ACROSS] for start in range(0, len(panels), N_ACROSS)]
     return Drawing(rows, 90 + 26 * len(y))
 

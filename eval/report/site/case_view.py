@@ -2,7 +2,7 @@
 
 The file is viser's own offline page (`viser` of the extra `view`): client, scene and float32 points in one HTML file
 that opens by a double click and asks no server and no network. Its scene tree, at the upper right, shows and hides
-every layer. plotly's Scatter3d was no choice: it gives up at the 1.4 million points of a wide drift.
+every layer.
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ import pandas as pd
 
 from eval.core.charts import Axis, Drawing, Panel, Series
 from eval.core.domains import domain_name
-from eval.report.charts import Chart, plotly_text
-from eval.report.regions.charts import look_of
+from eval.report.drawing.charts import Chart
+from eval.report.drawing.looks import look_of
 from eval.report.surface.unrolled import draw_unrolled
 from eval.report.tables import Section, conditions_table, methods_table, targets_table, with_rows
 from eval.running.run_data import RunData, every_condition, number, off_grids, stored_table
@@ -117,11 +117,12 @@ def _limits_panel(limits: pd.DataFrame, area_m2: float, names: Sequence[str], *,
     for name in names:
         own = limits[limits["variant"] == name]
         if len(own):
-            low, high = own["found_share_low"], own["found_share_high"]
-            hover = f"{plotly_text(name)}<br>%{{x:.1f}} mm: %{{y:.2f}}<extra></extra>"
             magnitude_mm = 1000.0 * own["magnitude_m"].to_numpy(dtype=np.float64)
             share_found = own["found_share"].to_numpy(dtype=np.float64)
-            lines.append(Series(magnitude_mm, share_found, look_of(name, names), name, low=low, high=high, hover=hover))
+            low, high = own["found_share_low"], own["found_share_high"]
+            lines.append(
+                Series(magnitude_mm, share_found, look_of(name), name, low=low, high=high, hover="{x:.1f} mm: {y:.2f}")
+            )
     ticks = {1000.0 * each: f"{1000 * each:g}" for each in MAGNITUDES_M}
     x = Axis("displacement [mm]", (1000.0 * EDGES_M[0], 600.0), is_log=True, ticks=ticks)
     y = Axis("windows found" if is_first else "", (-0.03, 1.03))

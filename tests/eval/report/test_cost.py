@@ -7,10 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from eval.report.charts import plotly_figure
 from eval.report.cost import COLUMNS, draw_pareto, front, pareto_table
 from eval.running.run_data import RunData
 from eval.running.runfolder import RunFolder
+from tests.eval.report.drawing.drawn import read_panels
 
 NAN = float("nan")
 
@@ -114,8 +114,8 @@ def test_the_picture_names_the_front(tmp_path: Path) -> None:
     (chart,) = draw_pareto(pareto_table(run(tmp_path, methods)))
     assert chart.name == "pareto_objects"
     assert chart.png.startswith(b"\x89PNG")
-    labels = [text for trace in plotly_figure(chart.drawing)["data"] for text in trace.get("text", ()) if text]
-    assert labels == ["<b>tunnelcd</b>", "<b>voxel-diff</b>", "<b>tunnelcd</b>"]
+    labels = [text for row in read_panels(chart.drawing) for panel in row for text in panel.texts.get("label", ())]
+    assert labels == ["tunnelcd", "voxel-diff", "tunnelcd"]
     front_text = chart.caption.partition("On the front: ")[2]
     assert "time of a pair, in distribution: tunnelcd, voxel-diff;" in front_text
     assert "c2c" not in front_text
@@ -127,5 +127,5 @@ def test_the_picture_names_the_front(tmp_path: Path) -> None:
 def test_methods_at_one_place_share_a_label(tmp_path: Path) -> None:
     methods = {"tunnelcd": (0.9, 3.0, 5.0), "paper": (0.3, 1.0, 2.0), "untrained": (0.3, 1.0, 2.0)}
     (chart,) = draw_pareto(pareto_table(run(tmp_path, methods)))
-    labels = [text for trace in plotly_figure(chart.drawing)["data"] for text in trace.get("text", ()) if text]
-    assert labels == ["<b>tunnelcd</b>", "<b>paper, untrained</b>"] * 2
+    labels = [text for row in read_panels(chart.drawing) for panel in row for text in panel.texts.get("label", ())]
+    assert labels == ["tunnelcd", "paper, untrained"] * 2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -15,7 +14,6 @@ import pytest
 
 from eval.core.charts import Axis, Drawing, Heat, Panel, Series
 from eval.core.figures import picture, png
-from eval.report.charts import plotly_text
 from eval.report.comparison import compare_sides, write_comparison
 from eval.report.latex import to_latex
 from eval.report.page import write_page
@@ -89,9 +87,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def test_names_add_no_element_attribute_or_address(pages: dict[str, Path]) -> None:
     found = {name: _Elements(page.read_text()).found for name, page in pages.items()}
     assert found["bad"] == found["good"]
-    # nor inside of scripts: a comment with a script in it hides the end of the script
-    for block in re.findall(r'type="application/json"[^>]*>(.*?)</script>', pages["bad"].read_text(), re.DOTALL):
-        assert not re.search("[<>&\u2028]", block) and json.loads(block)["data"]
+    assert pages["bad"].read_text().count("<script>") == 1
 
 
 def test_every_name_stands_on_the_page_as_it_is(pages: dict[str, Path]) -> None:
@@ -107,12 +103,9 @@ def test_every_chart_is_drawn_and_nothing_is_executed(pages: dict[str, Path], tm
     assert "<title>owned" not in dom and 'src="x"' not in dom
     charts = re.split(r'class="chart[^"]*" id="', dom)[1:]
     assert {chart.partition('"')[0] for chart in charts} >= {"by_scenario", "pareto_regions", "grid_1", "factor_1"}
-    for chart in charts:
-        assert 'class="main-svg"' in chart.partition("</figure>")[0]
-    # names in the legend are text; plotly would show its own tags as bold type, and hide others
     legend = html.unescape(next(chart for chart in charts if chart.startswith("by_scenario")).partition("</figure>")[0])
     for name in map(shown, HOSTILE):
-        assert f">{name}</text>" in legend
+        assert f"</svg>{name}</button>" in legend
 
 
 def test_the_comparison_page(pages: dict[str, Path], tmp_path: Path) -> None:
@@ -149,8 +142,3 @@ def test_latex_sets_names_as_text() -> None:
         assert not re.search(r"[\\%$#~^]", left), line
         assert left.count("&") == 1
     assert r"\textbackslash{}input\{/etc/passwd\}" in body
-
-
-def test_text_for_plotly_by_hand() -> None:
-    assert plotly_text("a<b> & %{x} $y") == "a&#60;b&#62; &#38; %&#123;x} &#36;y"
-    assert plotly_text("tunnelcd[extract.voxel_m=0.3]") == "tunnelcd[extract.voxel_m=0.3]"

@@ -47,8 +47,8 @@ def test_the_page_shows_them_as_undefined_and_says_so(run: Path) -> None:
     assert all(f"{name} (4)" in told for name in UNUSABLE) and f"`tunnelcd score {run}`" in told
     assert "regions.csv: infinite" in text
     table = text.partition('id="results"')[2]
-    assert f"<td>{PLAIN[1]}</td><td>{UNDEFINED}</td>" in table and "inf<" not in table
-    assert f'<td>{PLAIN[0]}</td><td class="best">0.90' in table
+    assert f">{PLAIN[1]}</a></td><td>{UNDEFINED}</td>" in table and "inf<" not in table
+    assert f'>{PLAIN[0]}</a></td><td class="best">0.90' in table
 
 
 def test_a_comparison_says_so_too(run: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +25,14 @@ from cdpipe.descriptors.sphere_image import COLUMNS, ROWS, pixels, sphere_image
 from cdpipe.mapping.mapping import build_map
 from cdpipe.model.config import load_config
 from cdpipe.model.types import DescriptorSet, MappedSession, PointMap
+from cdpipe.training.data import open_dataset, read_place_data
 from cdpipe.training.shard import FIELDS, encode_shard, read_about, read_shard
 from eval.core import cluster
 from eval.core.cluster import Where
 from eval.oracles.merge import OracleMerge, merged_by_truth
 from eval.scoring.merge_metrics import PAIR_RADIUS_M
 from eval.training import dataset_run
-from eval.training.dataset import Recipe, displace_poses, draw_merge_errors, make_shard
+from eval.training.dataset import Recipe, displace_poses, draw_merge_errors, make_shard, make_shards
 from eval.training.dataset_card import digest_of, fields_table
 from eval.training.dataset_run import make_dataset
 from eval.truth.adapters import pipeline_input
@@ -249,14 +251,14 @@ def fake_shards(monkeypatch: pytest.MonkeyPatch, shard: Shard, *, refused: int =
     """Let tunnels come at once, and count them."""
     made = []
 
-    def fake(family: str, seed: int, recipe: Recipe) -> bytes:
+    def fake(family: str, seed: int, recipe: Recipe) -> list[bytes]:
         made.append(seed)
         if seed == refused:
             raise ScenarioError("the rock fell in")
         text = dataset_run.shard_digest(load_scenario(family, seed, recipe.settings), seed, recipe)
-        return encode_shard(shard[0], {**shard[1], "seed": seed, "digest": text})
+        return [encode_shard(shard[0], {**shard[1], "seed": seed, "digest": text})] * recipe.afters
 
-    monkeypatch.setattr(dataset_run, "make_shard", fake)
+    monkeypatch.setattr(dataset_run, "make_shards", fake)
     return made
 
 
@@ -307,6 +309,46 @@ def test_the_card_counts_what_the_index_lists(tmp_path: Path, monkeypatch: pytes
     assert f"| {FAMILY} | train | 0 to 1 | 2 | {n} | {n} | {positive} |" in text
     assert f"`{digest_of(rows)}`" in text
     assert "tunnelcd dataset one\ntunnelcd dataset two" in text
+
+
+def test_several_after_sessions_are_shards_of_one_tunnel(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shard: Shard
+) -> None:
+    made = fake_shards(monkeypatch, shard)
+    recipe = replace(RECIPE, afters=3)
+    outcome = make_dataset([FAMILY], "0:2", recipe, tmp_path / "d")
+    n_pairs = shard[1]["counts"]["n_before"]
+    assert (outcome.n_made, outcome.n_pairs) == (2, 6 * n_pairs)
+    rows = list(csv.DictReader((tmp_path / "d" / "index.csv").read_text().splitlines()))
+    names = [f"smoke__one_box-0{end}.safetensors" for end in ("", "-after-2", "-after-3")]
+    assert [row["shard"] for row in rows[:3]] == names
+    text = (tmp_path / "d" / "README.md").read_text()
+    assert f"| {FAMILY} | train | 0 to 1 | 2 | {6 * n_pairs} |" in text
+    assert f"{2 * n_pairs} of the {6 * n_pairs} pairs are of a first after session" in text
+    (tmp_path / "d" / names[2]).unlink()
+    assert make_dataset([FAMILY], "0:2", recipe, tmp_path / "d").n_made == 1
+    assert made == [0, 1, 0]
+    with pytest.raises(InputError, match="--afters 3, not with"):
+        make_dataset([FAMILY], "0", RECIPE, tmp_path / "d")
+    tunnels = open_dataset(tmp_path / "d", "train")
+    assert len(tunnels) == 6
+    assert np.unique(read_place_data(tunnels).tunnels).tolist() == [0, 1]
+
+
+def test_a_second_after_session_has_the_same_before_session_and_changes(tmp_path: Path, shard: Shard) -> None:
+    read = []
+    for number, content in enumerate(make_shards(FAMILY, SEED, replace(RECIPE, afters=2))):
+        (tmp_path / f"{number}.safetensors").write_bytes(content)
+        read.append(read_shard(tmp_path / f"{number}.safetensors")[0])
+    first, second = read
+    shared = ("before_images", "before_ranges_m", "before_world_T_keyframe", "change_kind")
+    for name, array in shard[0].items():
+        np.testing.assert_array_equal(first[name], array)
+    for name in shared:
+        np.testing.assert_array_equal(first[name], second[name])
+    assert not np.array_equal(first["after_images"][0], second["after_images"][0])
+    assert second["change_is_observable"].all()
+    assert (second["after_visible"].sum(axis=(0, 1)) > 0).any()
 
 
 def test_another_recipe_or_somebody_s_folder_is_refused(

@@ -2,12 +2,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 
+from cdpipe.core.geometry import Float64Array
 from sim.geometry.mesh import (
     Mesh,
     NearSurface,
     box_mesh,
     crop_near,
+    cut_triangles,
     cylinder_mesh,
     join_meshes,
     move_mesh,
@@ -77,3 +80,35 @@ def test_near_part_is_every_triangle_whose_bounding_box_comes_close() -> None:
     np.testing.assert_array_equal(part.faces, mesh.faces[is_near])
     is_corner_in = (np.abs(triangles) <= reach).all(axis=2).any(axis=1)
     assert 50 < is_corner_in.sum() < is_near.sum() - 50
+
+
+def test_a_box_is_that_of_trimesh_to_the_bit() -> None:
+    for half_size_m in np.random.default_rng(3).uniform(0.001, 9.0, (50, 3)):
+        box, expected = box_mesh(half_size_m), trimesh.creation.box(extents=2.0 * half_size_m)
+        assert box.vertices.tobytes() == np.asarray(expected.vertices, np.float64).tobytes()
+        np.testing.assert_array_equal(box.faces, expected.faces)
+
+
+def test_a_cylinder_that_is_remembered_cannot_be_written() -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        cylinder_mesh(0.2, 0.3, 32).vertices[0] = 0.0
+
+
+def halve_one_by_one(triangle: Float64Array, edge_m: float) -> list[Float64Array]:
+    """Return the pieces of a triangle, in any order."""
+    lengths_m = [np.linalg.norm(triangle[corner] - triangle[corner - 2]) for corner in range(3)]
+    longest = int(np.argmax(lengths_m))
+    if lengths_m[longest] <= edge_m:
+        return [triangle]
+    a, b, c = np.roll(triangle, -longest, axis=0)
+    middle = (a + b) / 2
+    return [piece for half in ([a, middle, c], [middle, b, c]) for piece in halve_one_by_one(np.array(half), edge_m)]
+
+
+def test_triangles_are_halved_as_one_by_one() -> None:
+    triangles = np.random.default_rng(4).normal(size=(20, 3, 3))
+    triangles[0] = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]  # two edges of one length
+    pieces, owners = cut_triangles(triangles, 0.4)
+    for number, triangle in enumerate(triangles):
+        expected = sorted(piece.tobytes() for piece in halve_one_by_one(triangle, 0.4))
+        assert sorted(piece.tobytes() for piece in pieces[owners == number]) == expected

@@ -58,6 +58,44 @@ def test_far_from_the_origin_ranges_keep_their_precision() -> None:
     assert ranges_m[0] == pytest.approx(2.3, abs=1e-5)
 
 
+def crowded_room(n_boxes: int) -> list[Mesh]:
+    """Return a room, and boxes in it that stand in one another and in its walls."""
+    generator = np.random.default_rng(n_boxes)
+    boxes = [
+        move_mesh(box_mesh(generator.uniform(0.05, 0.4, 3)), make_pose(translation=generator.uniform(-3.2, 3.2, 3)))
+        for _ in range(n_boxes)
+    ]
+    return [inside_out(box_mesh((3.0, 3.0, 3.0))), *boxes]
+
+
+def test_trees_built_onto_one_another_answer_as_one_tree() -> None:
+    meshes = crowded_room(12)
+    origins = np.random.default_rng(1).uniform(-2.9, 2.9, (4000, 3))
+    directions = unit_vectors(4000, seed=2)
+    together = Caster(meshes)
+    bare = Caster(meshes[:1])
+    some = Caster(meshes[:5], onto=bare)
+    every = Caster(meshes, onto=some)
+    assert len({*together.hits(origins, directions)[1].tolist()}) > 10
+    for name in ("cast", "hits", "faces"):
+        for one, layered in zip(
+            getattr(together, name)(origins, directions), getattr(every, name)(origins, directions), strict=True
+        ):
+            assert one.tobytes() == layered.tobytes()
+    assert (bare.hits(origins, directions)[1] == 0).all()
+    assert every.n_meshes == 13
+    assert some.hits(origins, directions)[1].max() == 4
+
+
+def test_meshes_that_move_the_centre_of_the_scene_are_cast_as_one_tree() -> None:
+    room, far = crowded_room(0)[0], move_mesh(box_mesh((1, 1, 1)), make_pose(translation=(40.3, 0.0, 0.0)))
+    bare, both = Caster([room]), Caster([room, far], onto=Caster([room]))
+    origins, directions = np.tile([20.123, 0.1, 0.2], (3, 1)), np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 0, 1.0]])
+    assert (both.centre_m != bare.centre_m).any()
+    for one, other in zip(Caster([room, far]).hits(origins, directions), both.hits(origins, directions), strict=True):
+        assert one.tobytes() == other.tobytes()
+
+
 def slow_hits(
     meshes: list[Mesh], origins: Float64Array, directions: Float64Array
 ) -> tuple[Float64Array, Int64Array, Float64Array]:

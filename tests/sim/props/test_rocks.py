@@ -8,8 +8,18 @@ from scipy.spatial import ConvexHull
 from scipy.stats import kstest
 
 from cdpipe.core.geometry import stream
+from sim.geometry.mesh import join_meshes
 from sim.geometry.topology import edges_of
-from sim.props.rocks import passing_share, rock_mesh, rosin_rammler
+from sim.props.rocks import (
+    Rubble,
+    confine,
+    join_rubble,
+    lay_fragments,
+    passing_share,
+    rock_mesh,
+    rosin_rammler,
+    shift_rubble,
+)
 from sim.props.shapes import signed_volume_m3
 
 
@@ -45,3 +55,39 @@ def test_each_subdivision_takes_four_times_as_many_triangles_and_keys_differ() -
     same, other = rock_mesh((1, 1, 1), 3), rock_mesh((1, 1, 1), 4)
     np.testing.assert_array_equal(rock_mesh((1, 1, 1), 3).vertices, same.vertices)
     assert same.vertices.shape != other.vertices.shape or np.abs(same.vertices - other.vertices).max() > 0.05
+
+
+def laid_rubble(n: int) -> Rubble:
+    generator = stream(n, "rubble")
+    sizes, places = generator.uniform(0.1, 0.5, n), generator.uniform(-2.0, 2.0, (n, 2))
+    return lay_fragments(sizes, places, lambda xy: np.asarray(0.1 * xy[:, 0]), (-0.2, 0.1), generator)
+
+
+def test_rubble_is_moved_confined_and_joined_fragment_by_fragment() -> None:
+    rubble, other = laid_rubble(40), laid_rubble(3)
+    is_kept = np.arange(40) % 3 == 1
+    kept = rubble.kept(is_kept)
+    assert [each.vertices.tobytes() for each in kept.fragments] == [
+        each.vertices.tobytes() for each, keep in zip(rubble.fragments, is_kept, strict=True) if keep
+    ]
+    shifts_m = np.random.default_rng(0).normal(size=(40, 3))
+    for fragment, by_m, moved in zip(rubble.fragments, shifts_m, shift_rubble(rubble, shifts_m).fragments, strict=True):
+        np.testing.assert_array_equal(moved.vertices, fragment.vertices + by_m)
+        np.testing.assert_array_equal(moved.faces, fragment.faces)
+    low, high = np.array([-1.0, -1.5, -np.inf]), np.array([1.0, 1.5, 0.2])
+    assert any(each.vertices[:, 0].max() > 1.0 for each in rubble.fragments)
+    for before, after in zip(rubble.fragments, confine(rubble, low, high).fragments, strict=True):
+        assert (after.vertices.min(axis=0) >= low - 1e-12).all()
+        assert (after.vertices.max(axis=0) <= high + 1e-12).all()
+        np.testing.assert_allclose(np.ptp(after.vertices, axis=0), np.ptp(before.vertices, axis=0), atol=1e-12)
+    joined = join_rubble(kept, other)
+    whole, expected = joined.surface(), join_meshes([*kept.fragments, *other.fragments])
+    np.testing.assert_array_equal(whole.vertices, expected.vertices)
+    np.testing.assert_array_equal(whole.faces, expected.faces)
+    assert len(joined) == len(joined.fragments) == is_kept.sum() + 3
+
+
+def test_no_rubble_is_no_surface() -> None:
+    none = laid_rubble(4).kept(np.zeros(4, bool))
+    assert (len(none), none.fragments, len(none.surface().faces)) == (0, (), 0)
+    assert len(confine(shift_rubble(none, np.ones(3)), np.zeros(3), np.ones(3))) == 0

@@ -107,13 +107,15 @@ def merge_run(tmp_path: Path) -> RunFolder:
 def table_rows(page: str, caption: str) -> list[list[str]]:
     part = page[page.index(f"<caption>{caption}") :]
     part = part[: part.index("</table>")]
-    cells = [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row) for row in re.findall(r"<tr>(.*?)</tr>", part)]
+    cells = [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row) for row in re.findall(r"<tr[^>]*>(.*?)</tr>", part)]
     return [[html.unescape(re.sub("<[^>]*>", " ", cell)).strip() for cell in row] for row in cells]
 
 
 def test_a_run_that_ends_at_the_merge_shows_it_and_no_empty_sections(merge_run: RunFolder) -> None:
     page = html.unescape(write_page(merge_run.path).read_text())
-    assert re.findall(r'<h2 id="([^"]*)"', page) == ["merge", "definitions", "settings", "missing"]
+    assert re.findall(r'class="section" id="([^"]*)"', page) == [
+        "merge", "methods", "definitions", "settings", "missing"
+    ]  # fmt: skip
     shares = {line[0]: line[2] for line in table_rows(page, "Headline figures")[1:]}
     assert list(shares) == ["tunnelcd", "frame", "oracle-merge [noise_m=0.1, noise_deg=0.2]"]
     assert [share[:4] for share in shares.values()] == ["0.92", "0.00", "0.00"]
@@ -240,7 +242,7 @@ def test_an_ordinary_run_has_one_row_for_each_merge_and_one_picture_for_each_sce
         write_answer(run.answer("merge/plain", 0, str(each["variant"])), "x", report(np.eye(4)))
     write_failure(run.answer("merge/plain", 1, "tunnelcd"), "tunnelcd", "merge_refused", SLIDES, {}, CONFIG)
     page = write_page(run.path).read_text()
-    assert {"merge", "results"} <= set(re.findall(r'<h2 id="([^"]*)"', page))
+    assert {"merge", "results"} <= set(re.findall(r'class="section" id="([^"]*)"', page))
     found = table_rows(page, "What every merge measured")[2:]
     assert [(line[0], line[-1]) for line in found] == [
         ("seed 0 paper", f"accepted: all {len(GATES)} gates are reached"),

@@ -85,7 +85,7 @@ def test_table_by_hand(run: Path) -> None:
     assert [cell.text for cell in lines["theirs", "range_noise=false, sub_rays=7"]][1:] == ["0", *["\u2013"] * 5]
     # nothing to recall where nothing changed
     assert second.table.headings == ("setting", "pairs", "observable changes", "merge error [m]")
-    assert second.picture is None
+    assert second.chart is None
     assert "its sensor" in first.table.caption
 
 
@@ -105,8 +105,8 @@ def test_repeated_worlds_stand_under_their_own_heading_and_nowhere_else(run: Pat
     # the summary, then the results, then the effects
     assert groups[-5:] == [PLAIN, OTHER, "ours", "theirs", "ours"]
     assert not any(NOISE in group for group in groups)
-    assert re.findall(r'<h2 id="site-\d+">(.*?)</h2>', page) == [PLAIN]
-    assert '<h2 id="effects">' in page
+    assert re.findall(r'id="site-\d+">\s*<summary><h2>(.*?)</h2>', page) == [PLAIN]
+    assert '<details class="section" id="effects">' in page
     assert NOISE not in (run / "results.tex").read_text()
 
 
@@ -124,10 +124,10 @@ def test_a_plain_scenario_of_other_seeds_in_the_same_folder_hides_nothing(run: P
     results = pd.read_csv(run / "results.csv")
     plain = results[(results["scenario"] == PLAIN) & (results["seed"] == 0)].assign(scenario="n", seed=10000)
     only_here = plain.head(1).assign(scenario=NOISE, seed=2, variant="foreign")
-    before = draw_effects(read_run(run))
+    before = [(part.reference, part.table) for part in draw_effects(read_run(run))]
     pd.concat([results, plain, only_here]).to_csv(run / "results.csv", index=False)
     data = read_run(run)
-    assert draw_effects(data) == before
+    assert [(part.reference, part.table) for part in draw_effects(data)] == before
     # what no effect shows stands in the main tables
     assert scenarios(data, unchanged=False) == [PLAIN, "n", NOISE]
     assert named_variants(data, NOISE) == ["foreign"]

@@ -67,7 +67,7 @@ def test_table_by_hand(data: RunData) -> None:
 
 def test_the_page_shows_the_combinations(data: RunData) -> None:
     page = write_page(data.folder.path).read_text()
-    assert '<h2 id="factorial">' in page
+    assert '<details class="section" id="factorial">' in page
     assert len(pd.read_csv(data.folder.path / "factorial.csv")) == 15
     charts = draw_factorial(factorial_table(data))
     assert [chart.name for chart in charts] == ["factorial_in", "factorial_out", "factorial_all"]
@@ -91,5 +91,5 @@ def test_combinations_that_would_share_a_cell_are_not_crossed(tmp_path: Path) ->
 def test_one_source_with_several_extractions_is_no_factorial(tmp_path: Path) -> None:
     data = run_of(tmp_path, rows_of(f"c2c{SURFACE}", 0.6, 3), rows_of(f"c2c{VOXEL}", 0.4, 1), rows_of("m3c2", 1.0, 0))
     assert len(factorial_table(data)) == 0
-    assert '<h2 id="factorial">' not in write_page(tmp_path).read_text()
+    assert '<details class="section" id="factorial">' not in write_page(tmp_path).read_text()
     assert not (tmp_path / "factorial.csv").exists()

@@ -1,0 +1,1 @@
+"""Charts as elements of a page, and the look of every method."""

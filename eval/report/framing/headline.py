@@ -1,0 +1,139 @@
+"""What a page says first: which plan it is about, and who leads, in one sentence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from eval.core.domains import domain_name
+from eval.report.hardness import count_held, name_breaks
+from eval.report.summary import HEADLINES, rank_methods
+from eval.report.surface.surface import SURFACE_COLUMNS
+from eval.running.run_data import RunData, ends_at_merge, off_grids, plan_name, shown_variant, stored_table
+from eval.tables.columns import Column, share
+from eval.tables.merge_table import ALL_FAMILIES
+from eval.tables.rows import ALL_DOMAINS, is_told_the_truth, numbers, records
+
+_MOST_NAMES = 3
+_TOO_LITTLE = "The run holds too little to compare two methods."
+_SUBJECT = "change detection between two LiDAR sessions of a tunnel"
+_RIGHT = Column("right", "share of the pairs merged as their kind asks", "high", share)
+_HELD = Column("held", "axes on which it holds", "high", lambda n: f"{n:.0f}")
+_SILENT = Column("silent_share", "share of the unchanged pairs without a false region", "high", share)
+
+
+def write_title(data: RunData) -> str:
+    """Return the name of the plan and its question: the description up to its first full stop, colon or question."""
+    plan = data.provenance.get("plan")
+    description = " ".join(str(plan.get("description") or "").split()) if isinstance(plan, Mapping) else ""
+    question, mark, _ = description.partition("? ")
+    words = f"{question}?" if mark else description.partition(". ")[0].partition(": ")[0].removesuffix(".")
+    name = plan_name(data)
+    return f"{name}: {words or _SUBJECT}" if name else f"A run: {words or _SUBJECT}"
+
+
+def write_answer(data: RunData, merges: pd.DataFrame) -> str:
+    """Return who leads and who follows, by the figure that the plan is about, in each domain.
+
+    Args:
+        data: The run.
+        merges: As `eval.tables.merge_table.merge_table` returns it.
+    """
+    if ends_at_merge(data):
+        return _of_merges(merges)
+    told = _of_axes(data) or _of_surfaces(data) or _of_pairs(data) or _of_silence(data)
+    return told or _TOO_LITTLE
+
+
+def name_leaders(values: Iterable[tuple[str, float]], column: Column) -> str:
+    """Return the methods with the best value as written, and those that come next; "" without two methods.
+
+    Those that are told the truth take no part.
+
+    Args:
+        values: Name and value of each method, NaN where it is undefined.
+        column: Which direction wins, and how values are written.
+    """
+    fair = [(name, value) for name, value in values if not is_told_the_truth(name) and math.isfinite(value)]
+    if len(fair) < 2:
+        return ""
+    fair.sort(key=lambda each: -each[1] if column.better == "high" else each[1])
+    by_text: dict[str, list[str]] = {}
+    for name, value in fair:
+        by_text.setdefault(column.shown(value), []).append(name)
+    (best, leaders), *others = by_text.items()
+    if not others:
+        return f"all {len(leaders)} methods alike ({best})"
+    second, followers = others[0]
+    return f"{_joined(leaders)} ({best}), before {_joined(followers)} ({second})"
+
+
+def _joined(names: Sequence[str]) -> str:
+    shown = [_shortened(name) for name in names[:_MOST_NAMES]]
+    if len(names) > _MOST_NAMES:
+        shown.append(f"{len(names) - _MOST_NAMES} more")
+    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"
+
+
+def _shortened(name: str) -> str:
+    """Return a variant with the first of its settings alone."""
+    first, comma, _ = name.partition(",")
+    return f"{first}, \u2026]" if comma and "[" in first else name
+
+
+def _told(table: pd.DataFrame, column: Column) -> str:
+    """Return who leads in every domain of a table, by one of its columns."""
+    parts = []
+    for domain, own in table.groupby("domain", sort=False):
+        if domain == ALL_DOMAINS and table["domain"].nunique() > 1:
+            continue
+        leaders = name_leaders(zip(own["variant"].astype(str), numbers(own, column.key), strict=True), column)
+        parts += [f"{domain_name(str(domain))}: {leaders}"] if leaders else []
+    extreme = "Highest" if column.better == "high" else "Lowest"
+    return f"{extreme} {column.heading}, {'; '.join(parts)}." if parts else ""
+
+
+def _of_pairs(data: RunData) -> str:
+    ranked, shown, _ = rank_methods(data)
+    column = next((column for column in HEADLINES if column in shown and column.better == "high"), None)
+    return "" if column is None else _told(ranked, column)
+
+
+def _of_axes(data: RunData) -> str:
+    points = stored_table(data, "breaking_points")
+    if len(points) == 0:
+        return ""
+    held = count_held(points)
+    leaders = name_leaders(((name, float(n)) for name, n in held.items()), _HELD)
+    main = shown_variant(data)
+    return f"Holds on most axes: {leaders}; {name_breaks(points, main if main in held else next(iter(held)))}."
+
+
+def _of_surfaces(data: RunData) -> str:
+    table = off_grids(stored_table(data, "surface_table"), data)
+    limits = [column for column in SURFACE_COLUMNS if column.heading.startswith("limit, ")]
+    defined = [column for column in limits if len(table) and np.isfinite(numbers(table, column.key)).sum() > 1]
+    if not defined:
+        return ""
+    return _told(table, replace(defined[0], heading=defined[0].heading.replace("limit,", "displacement found on")))
+
+
+def _of_silence(data: RunData) -> str:
+    table = off_grids(stored_table(data, "regions_table"), data)
+    return _told(table[table["n_unchanged"] > 0], _SILENT) if len(table) else ""
+
+
+def _of_merges(merges: pd.DataFrame) -> str:
+    rows: list[dict[str, Any]] = records(merges[merges["family"] == ALL_FAMILIES]) if len(merges) else []
+    counts: dict[str, list[float]] = {}
+    for row in rows:
+        count = counts.setdefault(str(row["variant"]), [0.0, 0.0])
+        count[0] += float(row["n_within_target"])
+        count[1] += float(row["n_pairs"])
+    leaders = name_leaders([(name, right / n if n else math.nan) for name, (right, n) in counts.items()], _RIGHT)
+    return f"Highest {_RIGHT.heading}: {leaders}." if leaders else _TOO_LITTLE

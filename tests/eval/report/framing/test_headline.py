@@ -1,0 +1,83 @@
+"""The first words of a page: the plan with its question, and who leads by the figure that the plan is about."""
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from eval.report.framing.headline import name_leaders, write_answer, write_title
+from eval.running.run_data import RunData
+from eval.running.runfolder import RunFolder
+from eval.tables.columns import Column, share
+
+HIGH, LOW = (Column("a", "share", better, share) for better in ("high", "low"))
+NAN = float("nan")
+
+
+def run(folder: Path, rows: list[dict[str, Any]] | None = None, **plan: Any) -> RunData:
+    common = {"seed": 1, "status": "ok", "is_unchanged_pair": False, "n_observable": 4}
+    results = tuple({**common, "family": row.get("scenario"), **row} for row in rows or ())
+    return RunData(RunFolder(folder), results, (), (), {"plan": plan}, ())
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ([("a", 0.5), ("b", 0.9), ("c", 0.1)], "b (0.90), before a (0.50)"),
+        ([("a", 0.904), ("b", 0.9), ("c", 0.1)], "a and b (0.90), before c (0.10)"),
+        ([("a", 0.5), ("b", 0.5)], "all 2 methods alike (0.50)"),
+        ([*((name, 1.0) for name in "abcde"), ("f", 0.0)], "a, b, c and 2 more (1.00), before f (0.00)"),
+        ([("a", 0.5), ("oracle-merge", 0.9), ("b", NAN)], ""),
+        ([], ""),
+    ],
+)
+def test_leaders_by_hand(values: list[tuple[str, float]], told: str) -> None:
+    assert name_leaders(values, HIGH) == told
+
+
+def test_where_less_is_better_the_least_leads() -> None:
+    assert name_leaders([("a", 0.5), ("b", 0.1)], LOW) == "b (0.10), before a (0.50)"
+
+
+@pytest.mark.parametrize(
+    ("plan", "title"),
+    [
+        ({"name": "main", "description": "Every method on all: test pairs. More."}, "main: Every method on all"),
+        ({"name": "hard", "description": "What breaks whom? One drift."}, "hard: What breaks whom?"),
+        ({"name": "x"}, "x: change detection between two LiDAR sessions of a tunnel"),
+        ({}, "A run: change detection between two LiDAR sessions of a tunnel"),
+    ],
+)  # fmt: skip
+def test_the_title_is_the_plan_and_its_question(tmp_path: Path, plan: dict[str, str], title: str) -> None:
+    assert write_title(run(tmp_path, **plan)) == title
+
+
+def test_each_domain_has_its_leaders(tmp_path: Path) -> None:
+    shares = {"narrow": {"tunnelcd": 0.9, "c2c": 0.5, "oracle-merge": 1.0}, "cave": {"tunnelcd": 0.2, "c2c": 0.4}}
+    rows = [
+        {"scenario": world, "variant": name, "region_recall": value}
+        for world, own in shares.items() for name, value in own.items()
+    ]  # fmt: skip
+    assert write_answer(run(tmp_path, rows), pd.DataFrame()) == (
+        "Highest region recall, in distribution: tunnelcd (0.90), before c2c (0.50); "
+        "out of distribution: c2c (0.40), before tunnelcd (0.20)."
+    )
+
+
+def test_a_plan_with_axes_says_on_how_many_its_leader_holds(tmp_path: Path) -> None:
+    points = [
+        {"axis": axis, "unit": "m", "variant": name, "step": step, "value": 0.2, "is_measured": True, "recall": 0.5,
+         "n_judged": 3}
+        for name, steps in {"c2c": (1, 2), "tunnelcd": (0, 3), "oracle-merge": (0, 0)}.items()
+        for axis, step in zip(("size", "drift"), steps, strict=True)
+    ]  # fmt: skip
+    pd.DataFrame(points).to_csv(tmp_path / "breaking_points.csv", index=False)
+    rows = [{"scenario": "narrow", "variant": name} for name in ("c2c", "tunnelcd")]
+    told = write_answer(run(tmp_path, rows, targets={"method": "tunnelcd"}), pd.DataFrame())
+    assert told == "Holds on most axes: tunnelcd (1), before c2c (0); tunnelcd breaks at drift (0.2 m)."
+
+
+def test_a_run_of_one_method_names_no_leader(tmp_path: Path) -> None:
+    rows = [{"scenario": "narrow", "variant": "mine", "region_recall": 0.5}]
+    assert write_answer(run(tmp_path, rows), pd.DataFrame()) == "The run holds too little to compare two methods."

@@ -1,0 +1,60 @@
+"""Further after sessions of one world, against pairs that are simulated on their own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cdpipe.core.errors import ScenarioError
+from scenarios.library import load_scenario
+from sim.session.simulate import HeldPair, simulate_in_memory
+from sim.story.afters import simulate_afters
+
+FAMILY, SEED = "smoke/one_box", 5
+
+
+def ranges_mm(pair: HeldPair, session: str) -> np.ndarray:
+    held = pair.sessions[session].session  # type: ignore[index]
+    return np.concatenate([held.chunk(number).range_mm for number in range(held.n_chunks)])
+
+
+@pytest.fixture(scope="module", name="pairs")
+def pairs_fixture() -> list[HeldPair]:
+    scenario = load_scenario(FAMILY, SEED)
+    return list(simulate_afters(scenario, [scenario.after, scenario.after], SEED))
+
+
+def test_the_first_pair_is_that_of_a_scenario_without_further_sessions(pairs: list[HeldPair]) -> None:
+    alone = simulate_in_memory(load_scenario(FAMILY, SEED), SEED)
+    assert repr(pairs[0].truth) == repr(alone.truth)
+    for name in ("before", "after"):
+        np.testing.assert_array_equal(ranges_mm(pairs[0], name), ranges_mm(alone, name))
+        np.testing.assert_array_equal(pairs[0].sessions[name].change, alone.sessions[name].change)  # type: ignore[index]
+
+
+def test_each_after_session_is_another_drive_past_the_same_changes(pairs: list[HeldPair]) -> None:
+    first, *others = pairs
+    for pair in others:
+        assert pair.sessions["before"] is first.sessions["before"]
+        assert not np.array_equal(ranges_mm(pair, "after"), ranges_mm(first, "after"))
+        for change, same in zip(pair.truth.changes, first.truth.changes, strict=True):
+            assert (change.name, change.kind, change.world_T_object) == (same.name, same.kind, same.world_T_object)
+            # An added object has its returns in the after session, and its ghost is met by rays of the before session.
+            assert change.kind == "added"
+            assert change.n_returns == np.count_nonzero(pair.sessions["after"].change == change.id)
+            assert change.n_ghost_rays == same.n_ghost_rays > 0
+    assert not np.array_equal(ranges_mm(pairs[1], "after"), ranges_mm(pairs[2], "after"))
+
+
+def test_a_session_is_the_same_however_many_follow_it(pairs: list[HeldPair]) -> None:
+    scenario = load_scenario(FAMILY, SEED)
+    fewer = list(simulate_afters(scenario, [scenario.after], SEED))
+    assert len(fewer) == 2
+    np.testing.assert_array_equal(ranges_mm(fewer[1], "after"), ranges_mm(pairs[1], "after"))
+    assert repr(fewer[1].truth) == repr(pairs[1].truth)
+
+
+def test_changing_rock_is_refused() -> None:
+    scenario = load_scenario("surface/scar", SEED)
+    with pytest.raises(ScenarioError, match="--afters"):
+        next(simulate_afters(scenario, [scenario.after], SEED))
