@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ from scenarios.references import file_keys, find_contradictions
 from scenarios.schema import PROP_KINDS, Prop, Scenario, source_of
 
 CHECKED_SEEDS = range(8)
+_READ: ContextVar[dict[tuple[str, tuple[str, ...]], Document] | None] = ContextVar("read", default=None)
 SUFFIXES = (".yaml", ".yml")
 # A part of the scenario, or of a session, and what is wrong with it: value and rule.
 _OF_SCENARIO = re.compile(r": (sensor|platform)\.[\w.]+( = .*)")
@@ -202,8 +205,26 @@ def _line_of(line: str) -> tuple[str, int]:
     return (match[1], int(match[2])) if match else (line, 0)
 
 
+@contextmanager
+def scenarios_read_once() -> Iterator[None]:
+    """Read each scenario once in the block, however many seeds draw it; the files must not change meanwhile."""
+    token = _READ.set({})
+    try:
+        yield
+    finally:
+        _READ.reset(token)
+
+
 def _read(name_or_path: str, settings: Iterable[str]) -> Document:
-    settings = list(settings)
+    settings, known = tuple(settings), _READ.get()
+    if known is None:
+        return _read_anew(name_or_path, settings)
+    if (name_or_path, settings) not in known:
+        known[name_or_path, settings] = _read_anew(name_or_path, settings)
+    return known[name_or_path, settings]
+
+
+def _read_anew(name_or_path: str, settings: Sequence[str]) -> Document:
     document = _read_extended(_path_of(name_or_path), ())
     return apply_settings(_without_old_odometry(document, apply_settings(Document("--set", {}), settings)), settings)
 

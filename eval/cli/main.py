@@ -88,6 +88,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "trace": tracing.trace,
     "score": commands_run.score,
     "run": commands_run.run_command,
+    "merge-runs": commands_run.merge_runs_command,
     "export": commands_run.export,
     "evaluate": commands_leaderboard.evaluate,
     "submit": commands_leaderboard.submit,

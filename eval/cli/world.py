@@ -3,7 +3,8 @@
 # ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -146,13 +147,43 @@ def view(
         raise InputError(f"--html {html}: there is no folder {html.parent}: make it, or name another one")
     asked = join_world_settings(world, settings)
     hows = how_to_read(1 if after is None else 2, form, topics, trajectory, odometry, metadata, deskew=deskew)
-    if after is not None:
-        _view_answer(_require_answer(what, after, answer, seed, asked), hows, port, host, html, quiet)
+    with _sessions_at_hand([Path(what), *([] if after is None else [after])], quiet):
+        if after is not None:
+            _view_answer(_require_answer(what, after, answer, seed, asked), hows, port, host, html, quiet)
+        else:
+            _view_one(what, seed, asked, hows[0], port, host, html, quiet)
+
+
+@contextmanager
+def _sessions_at_hand(paths: Sequence[Path], quiet: bool) -> Iterator[None]:
+    """Make sessions again that `run --keep` removed from a run folder, for the time of the block."""
+    if all(path.exists() or path.parent == Path() for path in paths):
+        yield
         return
+    from eval.running.scaling.remaking import remade_below
+
+    with ExitStack() as stack:
+        with shown_progress(quiet) as progress:
+            stack.enter_context(remade_below(paths, progress))
+        yield
+
+
+def _view_one(
+    what: str,
+    seed: int | None,
+    settings: Sequence[str],
+    how: HowToRead,
+    port: int,
+    host: str,
+    html: Path | None,
+    quiet: bool,
+) -> None:
+    from cdpipe.core.errors import InputError
+
     if (Path(what) / "answer.json").is_file():
         raise InputError(f"{what}: an answer, without its sessions: `tunnelcd view BEFORE AFTER {what}`")
     _require_viser_for(host, port, html)
-    load = partial(_load_with_progress, what, seed, asked, hows[0], quiet=quiet)
+    load = partial(_load_with_progress, what, seed, settings, how, quiet=quiet)
     if html is None:
         _serve(load, what, port, host, quiet)
         return
