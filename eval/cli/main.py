@@ -79,6 +79,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "demo": commands_run.demo,
     "simulate": commands_world.simulate,
     "pair": commands_stories.pair,
+    "graft": commands_world.graft,
     "survey": commands_world.survey,
     "view": commands_world.view,
     "describe": commands_pair.describe,

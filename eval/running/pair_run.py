@@ -28,6 +28,7 @@ from eval.core.domains import domain_of
 from eval.core.output import remove, whole_file
 from eval.core.progress import RunProgress
 from eval.core.provenance import canonical_json, digest_parts, git_commit, now
+from eval.graft import make_pair
 from eval.oracles.merge import merged_by_truth
 from eval.oracles.regions import regions_by_truth
 from eval.plans.variants import Cell
@@ -39,9 +40,9 @@ from eval.running.stages import PairStages
 from eval.scoring.scoring import METRICS_VERSION, CaseScore, describe_recording, score_stored
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
+from scenarios.grafted import GraftScenario
 from scenarios.library import load_scenario
 from scenarios.schema import Scenario
-from sim.session.simulate import simulate_pair
 
 if sys.platform != "win32":
     import fcntl
@@ -74,7 +75,7 @@ class Pair:
     family: str
     kind: str
     seed: int
-    scenario: Scenario | None
+    scenario: GraftScenario | Scenario | None
     files: Mapping[str, str]
     error: str
     todo: tuple[Todo, ...]
@@ -101,7 +102,7 @@ class Tools:
     """
 
     draw: Callable[[str, int, tuple[str, ...]], Scenario] = load_scenario
-    simulate: Callable[[Scenario, int, Path, OnStage], None] = simulate_pair
+    simulate: Callable[[Scenario, int, Path, OnStage], None] = make_pair
     commit: Callable[[], str | None] = git_commit
     now: Callable[[], str] = now
 
