@@ -78,7 +78,7 @@ def test_unchanged_maps_have_no_object(tmp_path: Path) -> None:
 
 def test_what_asks_for_free_space_is_refused(tmp_path: Path) -> None:
     maps = [write(tmp_path / f"{sample}.ply", drift(sample)) for sample in (1, 2)]
-    with pytest.raises(InputError, match="without its scans.*use --preset m3c2, c2c or voxel-diff"):
+    with pytest.raises(InputError, match=r"without its scans.*use --preset m3c2, c2c or voxel-diff"):
         detect(*maps, before_T_after=np.eye(4))
 
 
