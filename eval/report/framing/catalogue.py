@@ -101,7 +101,9 @@ def _read_report(folder: Path, own: Path, questions: Mapping[str, str]) -> Repor
         plan=", ".join(str(described[key]) for key in ("name", "split") if described.get(key)),
         finished=str(provenance.get("finished") or "")[:10],
         page=_address(folder, page) if page in files else first,
-        contents=", ".join(f"{len(paths)} {kind if len(paths) > 1 else kind[:-1]}" for kind, paths in by_kind.items() if paths),
+        contents=", ".join(
+            f"{len(paths)} {kind if len(paths) > 1 else kind[:-1]}" for kind, paths in by_kind.items() if paths
+        ),
         files=[(_address(folder, path), path.name) for path in linked],
     )
 
