@@ -46,7 +46,8 @@ def bench(
 
 def list_command(
     what: Annotated[
-        Literal["scenarios", "props", "plans", "presets", "methods", "metrics", "sensors", "settings"] | None,
+        Literal["scenarios", "props", "plans", "presets", "methods", "metrics", "sensors", "recordings", "settings"]
+        | None,
         typer.Argument(help="this alone, with one-line descriptions; of settings with default and unit"),
     ] = None,
     as_json: AsJson = False,
@@ -83,6 +84,7 @@ _TITLES = {
     "methods": "methods",
     "metrics": "metrics of plugins",
     "sensors": "sensor profiles",
+    "recordings": "public recordings",
 }
 
 
