@@ -46,8 +46,8 @@ def code_blocks(page: Path) -> list[str]:
     """Return the blocks of a page, or the cells of a notebook, of whose text only commands with arguments."""
     if page.suffix == ".ipynb":
         cells = [("".join(cell["source"]), cell["cell_type"]) for cell in json.loads(page.read_text())["cells"]]
-        told = [line for text, kind in cells if kind == "markdown" for line in re.findall(r"`(tunnelcd [a-z]+ [^`]+)`", text)]
-        return [*(text for text, kind in cells if kind == "code"), *told]
+        code, told = ("\n".join(text for text, kind in cells if kind == each) for each in ("code", "markdown"))
+        return [code, *re.findall(r"`(tunnelcd [a-z]+ [^`]+)`", told)]
     return re.findall(r"^```[^\n]*\n(.*?)^```", page.read_text(), re.M | re.S)
 
 

@@ -35,11 +35,10 @@ def written_file(notebook: str, name: str) -> str:
 def execute(name: str, folder: Path) -> None:
     """Execute a notebook in a folder; a cell that fails raises."""
     client = pytest.importorskip("nbclient", reason="pip install 'tunnelcd[dev]'")
-    config = pytest.importorskip("traitlets.config").Config()
-    config.KernelManager.transport = "ipc"
+    pytest.importorskip("ipykernel", reason="pip install 'tunnelcd[dev]'")
     notebook = read(ROOT / "eval" / "notebooks" / f"{name}.ipynb")
     place = {"metadata": {"path": str(folder)}}
-    client.NotebookClient(notebook, timeout=SECONDS, kernel_name="python3", resources=place, config=config).execute()
+    client.NotebookClient(notebook, timeout=SECONDS, kernel_name="python3", resources=place).execute()
 
 
 def test_there_are_two_notebooks() -> None:
@@ -85,7 +84,7 @@ def test_the_method_has_fifteen_lines_and_finds_what_came() -> None:
     (found,) = names["find_changes"](np.concatenate([floor, box]), floor, path)
     np.testing.assert_array_equal(np.sort(found), len(floor) + np.arange(len(box)))
     assert names["find_changes"](floor, floor, path) == []
-    assert names["find_changes"](np.concatenate([floor, box]), floor, path + [0, 20, 0]) == []
+    assert names["find_changes"](np.concatenate([floor, box]), floor, path - 20) == []
 
 
 @pytest.mark.soak
@@ -103,7 +102,7 @@ def test_the_notebook_of_a_method_runs(tmp_path: Path) -> None:
 @pytest.mark.soak
 def test_the_notebook_of_a_mine_runs(tmp_path: Path) -> None:
     execute("own_mine", tmp_path)
-    assert pd.read_csv(tmp_path / "answer" / "objects.csv")["kind"].value_counts().to_dict() == {"added": 1, "removed": 1}
+    assert sorted(pd.read_csv(tmp_path / "answer" / "objects.csv")["kind"]) == ["added", "removed"]
     results = pd.read_csv(tmp_path / "grid" / "results.csv")
     grid = results[results["variant"].str.contains("extract.voxel_m=")]
     assert len(grid) == 12
