@@ -14,7 +14,7 @@ import struct
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -324,7 +324,7 @@ def _dataset(folder: Path) -> None:
     (folder / "index.csv").unlink()
     about = {"family": "smoke/one_box", "seed": 3, "digest": "d", "reason": "too narrow"}
     (folder / "smoke__one_box-3.safetensors.refused.json").write_text(json.dumps(about))
-    document = {"format": FORMAT, "format_version": FORMAT_VERSION, "recipe": asdict(Recipe()), "commands": ["c"]}
+    document = {"format": FORMAT, "format_version": FORMAT_VERSION, "recipe": Recipe().document(), "commands": ["c"]}
     (folder / "dataset.json").write_text(json.dumps(document))
 
 

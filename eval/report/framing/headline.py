@@ -109,6 +109,8 @@ def _of_axes(data: RunData) -> str:
     if len(points) == 0:
         return ""
     held = count_held(points)
+    if not held:
+        return ""
     leaders = name_leaders(((name, float(n)) for name, n in held.items()), _HELD)
     main = shown_variant(data)
     return f"Holds on most axes: {leaders}; {name_breaks(points, main if main in held else next(iter(held)))}."

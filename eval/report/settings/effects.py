@@ -87,7 +87,7 @@ def effect_chart(panels: Mapping[str, pd.DataFrame], look: Callable[[str], Look]
         series = [Series([0.0, 0.0], [0.0, bottom], _ZERO)]
         for order, variant in enumerate(variants):
             own = table[table["variant"] == variant]
-            places = own["setting"].map(middles) + (order - (len(variants) - 1) / 2) * step
+            places = own["setting"].map(middles).astype(float) + (order - (len(variants) - 1) / 2) * step
             dots = replace(look(variant), width=0.0)
             ends = {"low": own["low"], "high": own["high"]}
             series.append(Series(own["difference"], places.tolist(), dots, variant, is_across=True, **ends))

@@ -59,7 +59,7 @@ def test_every_fault_is_told_with_what_mends_it(command: Command, monkeypatch: p
     def version(name: str) -> str:
         if name in ("mujoco", "viser"):
             raise metadata.PackageNotFoundError(name)
-        return {"numpy": "1.26.4", "dask": "2026.8.0"}.get(name, "99.0")
+        return {"numpy": "1.26.4", "dask": "2026.8.0"}.get(name, "9999.0")
 
     monkeypatch.setattr(doctor, "metadata", SimpleNamespace(**vars(metadata) | {"version": version}))
     monkeypatch.setitem(sys.modules, "small_gicp", None)
@@ -69,7 +69,7 @@ def test_every_fault_is_told_with_what_mends_it(command: Command, monkeypatch: p
     assert err.splitlines() == [
         f"error: numpy: 1.26.4 is not >=2.2: pip install --upgrade '{wanted['numpy']}'",
         f"error: mujoco: not installed: pip install '{wanted['mujoco']}'",
-        "error: small_gicp: 99.0; ModuleNotFoundError: import of small_gicp halted; None in sys.modules: "
+        "error: small_gicp: 9999.0; ModuleNotFoundError: import of small_gicp halted; None in sys.modules: "
         f"pip install --force-reinstall '{wanted['small_gicp']}'",
     ]
     # an extra that is not there is no fault
