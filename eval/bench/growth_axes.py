@@ -68,8 +68,9 @@ def list_axes() -> dict[str, Axis]:
     every = (
         Axis("points", "map points, by the cell", _grow_points, _MAPPING[1:], (0.4, 0.28, 0.2, 0.14, 0.1),
              (0.8, 0.6, 0.4)),
-        Axis("length", "map points, by the path", _grow_length, _MAPPING, (62.5, 125, 250, 500, 1000), (10, 20, 40),
+        Axis("length", "path [m]", _grow_length, (*_MAPPING, *cut), (62.5, 125, 250, 500, 1000), (10, 20, 40),
              (2500, 5000)),
+        Axis("surface", "path [m]", _grow_surface, ("surface",), (62.5, 125, 250, 500), (10, 20)),
         Axis("keyframes", "keyframes", _grow_keyframes, _MAPPING[2:], (8, 4, 2, 1, 0.5), (4, 2, 1)),
         Axis("regions", "regions", _grow_regions, cut, (4, 8, 16, 32, 64), (1, 2, 3), (128, 256)),
         Axis("objects", "objects", _grow_objects, cut, (4, 8, 16, 32, 64), (1, 2, 3), (128, 256)),
@@ -124,7 +125,18 @@ def _grow_points(voxel_m: float, meter: StageMeter) -> float:
 
 
 def _grow_length(length_m: float, meter: StageMeter) -> float:
-    return _detect(meter, length_m, 2.0)["map_points_before"]
+    _detect(meter, length_m, 2.0, [f"query.n_regions={_count_heaps(length_m)}"])
+    return length_m
+
+
+def _grow_surface(length_m: float, meter: StageMeter) -> float:
+    regions = f"query.n_regions={_count_heaps(length_m)}"
+    _detect(meter, length_m, 2.0, [regions, "map.consistency=none", "surface.method=planes"])
+    return length_m
+
+
+def _count_heaps(length_m: float) -> int:
+    return max(1, round(length_m / _HEAPS_M))
 
 
 def _grow_keyframes(spacing_m: float, meter: StageMeter) -> float:

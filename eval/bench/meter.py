@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -13,6 +14,8 @@ from cdpipe.model.types import PosedScan, ScanSource, WrappedScans
 from cdpipe.pipeline import Done, Hooks
 
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+# Whether the first pass over a session belongs to its map or to its consistent poses is known by what follows.
+_FIRST_PASS = "pass 1"
 _STAGES = {
     "map before": "mapping", "map after": "mapping", "describe keyframes": "descriptors",
     "describe spheres": "sphere descriptors",
@@ -53,12 +56,22 @@ class StageMeter(Hooks):
         self._book()
         if self._stage:
             cost = self.costs[self._stage]
-            cost.peak_mb = max(peak_mb(), cost.peak_mb) if cost.peak_mb == cost.peak_mb else peak_mb()
+            cost.peak_mb = _larger(peak_mb(), cost.peak_mb)
         self._stage = stage
         if stage:
             self.costs.setdefault(stage, StageCost())
             restart_peak()
+        if stage != _FIRST_PASS:
+            self._settle("consistency" if stage == "consistency" else "mapping")
         self._began = time.perf_counter(), time.process_time()
+
+    def _settle(self, stage: str) -> None:
+        """Book what the first pass has cost on a stage."""
+        first = self.costs.pop(_FIRST_PASS, None)
+        if first is not None:
+            cost = self.costs.setdefault(stage, StageCost())
+            cost.wall_s, cost.cpu_s = cost.wall_s + first.wall_s, cost.cpu_s + first.cpu_s
+            cost.peak_mb = _larger(first.peak_mb, cost.peak_mb)
 
     @contextmanager
     def aside(self, stage: str) -> Iterator[None]:
@@ -82,7 +95,7 @@ class StageMeter(Hooks):
     def _follow(self, name: str, done: int, total: int) -> None:
         stage, _, step = name.partition(": ")
         is_registered = bool(step) and not step.startswith("pass ")
-        self.start("consistency" if is_registered else _STAGES.get(stage, stage))
+        self.start("consistency" if is_registered else step if step == _FIRST_PASS else _STAGES.get(stage, stage))
 
 
 class MeteredScans(WrappedScans):
@@ -106,6 +119,11 @@ class MeteredScans(WrappedScans):
             if scan is None:
                 return
             yield scan
+
+
+def _larger(one: float, other: float) -> float:
+    """Return the larger of two figures; NaN is none."""
+    return one if math.isnan(other) else max(one, other)
 
 
 def peak_mb() -> float:

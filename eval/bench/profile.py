@@ -80,10 +80,11 @@ def measure_scenario(document: Mapping[str, Any]) -> list[dict[str, Any]]:
     with TemporaryDirectory() as folder:
         simulated = _simulate(name, seed, Path(folder))
         compared, seconds = _detect(Path(folder), has_surface=document["has_surface"])
-    rows = _rows(name, "simulate", simulated, _SIMULATE) + _rows(name, "detect", compared, _DETECT)
-    for part, stage in _PARTS.items():
-        rows.append(_row(name, "detect", stage, wall_s=seconds.get(part)))
-    return rows
+    of_detect = _rows(name, "detect", compared, _DETECT)
+    after_merge = 1 + [row["stage"] for row in of_detect].index("merge")
+    parts = [_row(name, "detect", stage, wall_s=seconds.get(part)) for part, stage in _PARTS.items()]
+    of_detect[after_merge:after_merge] = parts
+    return _rows(name, "simulate", simulated, _SIMULATE) + of_detect
 
 
 def _simulate(name: str, seed: int, folder: Path) -> StageMeter:
