@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.isolation import run_isolated
+from cdpipe.core.isolation import ProcessDiedError, run_isolated
 from cdpipe.core.yamlfile import suggest
 from eval.bench.exponents import fit_growth
 from eval.bench.growth_axes import Axis, list_axes, measure_size
@@ -63,15 +63,20 @@ def measure_growth(
         run: Calls a function with a document, in a process of its own.
 
     Returns:
-        `machine`, `commit`, `rows` (one for each axis and stage) and `measured` (one for each axis, size and stage).
+        `machine`, `commit`, `rows` (one for each axis and stage), `measured` (one for each axis, size and stage), and
+        `failed`: sizes whose process died, as it does where memory does not suffice.
     """
     todo = [(axis, size) for axis in axes for size in _sizes(axis, quick=quick, large=large)]
     measured: list[dict[str, Any]] = []
+    failed: list[dict[str, Any]] = []
     for done, (axis, size) in enumerate(todo):
         on_progress(f"{axis.name} {size:g}", done, len(todo))
-        measured += _as_rows(axis.name, size, run(measure_size, {"axis": axis.name, "size": size}))
+        try:
+            measured += _as_rows(axis.name, size, run(measure_size, {"axis": axis.name, "size": size}))
+        except ProcessDiedError as error:
+            failed.append({"axis": axis.name, "asked": size, "reason": str(error)})
     rows = [row for axis in axes for row in _fit_axis(axis, measured)]
-    return {"machine": machine(), "commit": git_commit(), "rows": rows, "measured": measured}
+    return {"machine": machine(), "commit": git_commit(), "rows": rows, "measured": measured, "failed": failed}
 
 
 def _sizes(axis: Axis, *, quick: bool, large: bool) -> list[float]:
@@ -118,13 +123,16 @@ def judge(exponent: float, last: float, largest_s: float) -> str:
     return "rising" if last > LIMIT else ""
 
 
-def summarise_growth(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return one line: how many exponents are at most the limit, and which are above it."""
+def summarise_growth(table: Mapping[str, Any]) -> str:
+    """Return one line: how many exponents are at most the limit, which are above it, and what was not measured."""
+    rows = table["rows"]
     judged = [row for row in rows if row["verdict"] != "short" and row["exponent"] == row["exponent"]]
     told = []
     for verdict, words in (("above", f"above {LIMIT:g}"), ("rising", f"above {LIMIT:g} at the last step alone")):
         names = [f"{row['axis']}: {row['stage']}" for row in judged if row["verdict"] == verdict]
         told += [f"{words}: {', '.join(names)}"] if names else []
+    died = [f"{each['axis']} {each['asked']:g} ({each['reason']})" for each in table["failed"]]
+    told += [f"not measured, the process died: {', '.join(died)}"] if died else []
     n_above = sum(row["verdict"] == "above" for row in judged)
     return "; ".join([f"{len(judged) - n_above} of {len(judged)} exponents are at most {LIMIT:g}", *told])
 

@@ -15,7 +15,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import cdpipe
-from cdpipe.core.isolation import run_isolated
+from cdpipe.core.errors import InputError
+from cdpipe.core.isolation import ProcessDiedError, run_isolated
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import use_threads
 from cdpipe.io.readers import open_session
@@ -62,14 +63,17 @@ def measure_profile(
         time), peak_mb. A part of a stage, whose name holds a colon, has wall_s alone.
 
     Raises:
-        InputError: A scenario is unknown, or its pair cannot be merged.
+        InputError: A scenario is unknown, its pair cannot be merged, or its process died.
     """
     for name in scenarios:
         load_scenario(name, seed)  # a mistake is told before the first is measured
     rows = []
     for done, name in enumerate(scenarios):
         on_progress(name, done, len(scenarios))
-        rows += run(measure_scenario, {"scenario": name, "seed": seed, "has_surface": has_surface})
+        try:
+            rows += run(measure_scenario, {"scenario": name, "seed": seed, "has_surface": has_surface})
+        except ProcessDiedError as error:
+            raise InputError(f"{name}: the process that measures it died ({error}): is there enough memory?") from error
     return {"machine": machine(), "commit": git_commit(), "seed": seed, "rows": rows}
 
 

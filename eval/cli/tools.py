@@ -97,7 +97,7 @@ def _print_growth(table: dict[str, Any], written: list[Path]) -> None:
 
     shown = pd.DataFrame(table["rows"]).drop(columns=["axis", "n"])
     print_table(f"growth, {_machine(table)}; figure = c * size ** exponent; low, high: 95 %; last: last step", shown)
-    echo(_with_files(summarise_growth(table["rows"]), written))
+    echo(_with_files(summarise_growth(table), written))
 
 
 def _print_profile(table: dict[str, Any], written: list[Path]) -> None:
