@@ -6,7 +6,7 @@ OUT ?= demo
 comma := ,
 TEST_PROCESSES ?= 2
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
-EXTRAS := cluster,dufomap,formats,kiss,m3c2,octomap,odometry,ouster,view
+EXTRAS := cluster,dufomap,formats,kiss,m3c2,octomap,odometry,ouster,parquet,view
 LOWEST := .venv-lowest
 NEWEST := .venv-newest
 AUDIT := .venv-audit
@@ -92,10 +92,12 @@ $(AUDIT)/.installed: constraints.txt
 		pip-audit pip-licenses
 	touch $@
 
-# Kill and disturb a plan and every command that writes, for MINUTES; nothing may be lost. The table is SOAK/soak.md.
+# Execute the notebooks. Then kill and disturb a plan and every command that writes, for MINUTES; nothing may be lost.
+# The table is SOAK/soak.md.
 MINUTES ?= 30
 SOAK ?= soak
 soak: $(VENV)/.installed-dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m soak tests/eval/notebooks
 	$(BIN)/python -m tests.soak --minutes $(MINUTES) --out $(SOAK)
 
 # Peak memory and time of 10 km of tunnel, of 1,000 changes and of a plan of 5,000 cells.

@@ -36,6 +36,7 @@ from cdpipe.mapping.airborne import clear
 from cdpipe.mapping.counted import CountedScans
 from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.recorded_frames import regions_as_mapped, report_as_recorded
+from cdpipe.mapping.scanless import adapt_to_whole_maps
 from cdpipe.mapping.session_check import check_session, unit_hint
 from cdpipe.merge.coverage import measure_coverage
 from cdpipe.merge.merge import merge_maps, take_known_merge
@@ -122,6 +123,7 @@ def detect(
     hooks = hooks or Hooks()
     (before, stored_before), (after, stored_after) = (_open(each, config) for each in (before, after))
     sources, stored = (before, after), (stored_before, stored_after)
+    config = adapt_to_whole_maps(sources, config, is_merge_known=known is not None)
     mapped = map_pair(sources, config, hooks, stored)
     try:
         _warn_of_few_views(mapped.value, config)

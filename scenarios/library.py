@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,10 +18,12 @@ from cdpipe.core.yamlfile import Document, apply_settings, read_yaml, suggest, v
 from scenarios.catalogue import family_files, family_of, prop_files, prop_names, read_prop
 from scenarios.dangling import Mistake, find_dangling, items_at, mapping_at
 from scenarios.distributions import draw, find_malformed, is_distribution, join_key, merge_trees
+from scenarios.grafted import GraftScenario, take_props
 from scenarios.references import file_keys, find_contradictions
 from scenarios.schema import PROP_KINDS, Prop, Scenario, source_of
 
 CHECKED_SEEDS = range(8)
+_READ: ContextVar[dict[tuple[str, tuple[str, ...]], Document] | None] = ContextVar("read", default=None)
 SUFFIXES = (".yaml", ".yml")
 # A part of the scenario, or of a session, and what is wrong with it: value and rule.
 _OF_SCENARIO = re.compile(r": (sensor|platform)\.[\w.]+( = .*)")
@@ -43,6 +47,30 @@ def load_scenario(name_or_path: str, seed: int, settings: Iterable[str] = ()) ->
         raise InputError(f"seed = {seed}: expected a whole number >= 0")
     scenario, mistakes = _draw_scenario(_read(name_or_path, settings), seed)
     return _require_valid(scenario, mistakes)
+
+
+def load_grafted(name_or_path: str, recording: Mapping[str, Any], seed: int) -> GraftScenario:
+    """Return the props of a scenario as its seed draws them, to be grafted into a recording.
+
+    Args:
+        name_or_path: A name of `scenario_names()`, or a YAML file; "none" for no props. Of a scenario with a tunnel
+            only the props count, without their places.
+        recording: Values of `Recording`; paths as seen from the working folder.
+        seed: Not negative.
+
+    Raises:
+        ScenarioError, InputError: As `load_scenario`; or the file names a recording of its own.
+    """
+    document = Document(name_or_path, {"family": "graft"}) if name_or_path == "none" else _read(name_or_path, ())
+    tree = take_props(document.value) if mapping_at(document.value, "tunnel") else document.value
+    if "recording" in tree:
+        where = document.where(("recording",))
+        raise ScenarioError(f"{where}: recording: the file names its own: `tunnelcd simulate` takes such a file")
+    origins = {**document.origins, ("recording",): "the command line"}
+    given = replace(document, value={**tree, "recording": dict(recording)}, origins=origins)
+    scenario = _require_valid(*_draw_scenario(given, seed))
+    assert isinstance(scenario, GraftScenario)  # a tree with a recording is one
+    return scenario
 
 
 def check_scenario(name_or_path: str, settings: Iterable[str] = ()) -> Scenario:
@@ -89,7 +117,7 @@ def _draw_scenario(document: Document, seed: int) -> tuple[Scenario | None, list
     references = find_dangling(tree) + unknown
     mistakes += [_format_mistake(place, key, rule) for key, rule in references]
     try:
-        scenario = validate(Scenario, replace(place, value=tree))
+        scenario = validate(GraftScenario if "recording" in tree else Scenario, replace(place, value=tree))
     except InputError as error:
         mistakes += _drop_inherited(_drop_repeated(str(error).splitlines(), drawn.broken, references))
         return None, _tell_copies_once(mistakes, drawn.origins)
@@ -141,7 +169,8 @@ def _resolve_files(document: Document) -> tuple[dict[Any, Any], list[str]]:
     for key, name in file_keys(document.value):
         holder, colon, line = document.where(key).rpartition(":")
         path = Path(holder).parent / name if colon and line.isdigit() else Path(name)
-        if not path.is_file():
+        is_there = path.exists() if key[0] == "recording" else path.is_file()
+        if not is_there:
             seen = "" if str(path) == name else f": expected {path}"
             missing.append(_format_mistake(document, key, f"no such file{seen}"))
         tree = _replace_at(tree, key, str(path))
@@ -202,8 +231,26 @@ def _line_of(line: str) -> tuple[str, int]:
     return (match[1], int(match[2])) if match else (line, 0)
 
 
+@contextmanager
+def scenarios_read_once() -> Iterator[None]:
+    """Read each scenario once in the block, however many seeds draw it; the files must not change meanwhile."""
+    token = _READ.set({})
+    try:
+        yield
+    finally:
+        _READ.reset(token)
+
+
 def _read(name_or_path: str, settings: Iterable[str]) -> Document:
-    settings = list(settings)
+    settings, known = tuple(settings), _READ.get()
+    if known is None:
+        return _read_anew(name_or_path, settings)
+    if (name_or_path, settings) not in known:
+        known[name_or_path, settings] = _read_anew(name_or_path, settings)
+    return known[name_or_path, settings]
+
+
+def _read_anew(name_or_path: str, settings: Sequence[str]) -> Document:
     document = _read_extended(_path_of(name_or_path), ())
     return apply_settings(_without_old_odometry(document, apply_settings(Document("--set", {}), settings)), settings)
 

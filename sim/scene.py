@@ -13,7 +13,9 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array
+from scenarios.grafted import GraftScenario
 from scenarios.schema import Scenario
 from sim.displacement.displace import Displacement, displace
 from sim.displacement.follow import (
@@ -158,8 +160,10 @@ def lay_ground(scenario: Scenario, seed: int) -> Ground:
     """Mesh the tunnel, furnish it and set the props down.
 
     Raises:
-        ScenarioError: As `build_world`.
+        ScenarioError: As `build_world`; or the scenario's world is a recording.
     """
+    if isinstance(scenario, GraftScenario):
+        raise ScenarioError(f"{scenario.family}: its world is a recording: `tunnelcd simulate` makes a pair, view that")
     tunnel = scenario.tunnel
     centreline = build_centreline(tunnel, seed)
     wall = mesh_tunnel(tunnel, centreline, seed) if tunnel.mesh is None else tunnel_mesh(tunnel.mesh)

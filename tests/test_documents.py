@@ -62,7 +62,7 @@ def test_every_path_module_and_command_exists(page: Path) -> None:
     targets = re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(), re.MULTILINE)
     for target in re.findall(r"(?:^|`)make ([a-z][\w-]*)", text, re.MULTILINE):
         assert target in targets, target
-    for command in re.findall(r"^tunnelcd (\w+)", text, re.MULTILINE) + [
+    for command in re.findall(r"^tunnelcd ([\w-]+)", text, re.MULTILINE) + [
         word.split()[1] for word in quoted if re.match(r"tunnelcd [a-z]+\b", word)
     ]:
         assert command in COMMANDS, command
@@ -77,7 +77,7 @@ def test_long_options_of_the_commands_in_blocks_exist() -> None:
     for page in PAGES:
         for block in re.findall(r"^```[^\n]*\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
             for line in block.splitlines():
-                found = re.match(r"tunnelcd (\w+) ([^#]*)", line)
+                found = re.match(r"tunnelcd ([\w-]+) ([^#]*)", line)
                 if found is None or found[1] not in COMMANDS:
                     continue
                 known = {name for option in COMMANDS[found[1]].params for name in option.opts}

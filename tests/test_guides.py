@@ -1,5 +1,6 @@
 """Guides and command lines of the pages: guides do what they say, and the command line takes every line shown."""
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -24,6 +25,7 @@ PAGES = [
     *sorted(ROOT.glob("*.md")),
     *sorted(page for folder in ("cdpipe", "eval", "scenarios", "sim") for page in (ROOT / folder).rglob("*.md")),
 ]
+NOTEBOOKS = sorted((ROOT / "eval" / "notebooks").glob("*.ipynb"))
 # what stands for a number of the reader's
 NUMBERS = {"N": "1", "S": "1"}
 
@@ -40,12 +42,21 @@ def write_blocks(page: str, folder: Path) -> Path:
     return folder
 
 
+def code_blocks(page: Path) -> list[str]:
+    """Return the blocks of a page, or the cells of a notebook, of whose text only commands with arguments."""
+    if page.suffix == ".ipynb":
+        cells = [("".join(cell["source"]), cell["cell_type"]) for cell in json.loads(page.read_text())["cells"]]
+        code, told = ("\n".join(text for text, kind in cells if kind == each) for each in ("code", "markdown"))
+        return [code, *re.findall(r"`(tunnelcd [a-z]+ [^`]+)`", told)]
+    return re.findall(r"^```[^\n]*\n(.*?)^```", page.read_text(), re.M | re.S)
+
+
 def command_lines() -> list[tuple[str, str]]:
-    """Return (page, line) of every command of ours in a block of a page; lines that go on are one."""
+    """Return (page, line) of every command of ours in a block of a page or notebook; lines that go on are one."""
     found = []
-    for page in PAGES:
-        for block in re.findall(r"^```[^\n]*\n(.*?)^```", page.read_text(), re.M | re.S):
-            lines = block.replace("\\\n", " ").splitlines()
+    for page in (*PAGES, *NOTEBOOKS):
+        for block in code_blocks(page):
+            lines = [line.removeprefix("!") for line in block.replace("\\\n", " ").splitlines()]
             found += [(page.relative_to(ROOT).as_posix(), line) for line in lines if line.startswith("tunnelcd ")]
     return found
 
@@ -63,6 +74,7 @@ def parse(line: str) -> None:
 def test_the_command_line_takes_every_line_of_the_pages() -> None:
     lines = command_lines()
     assert {page for page, _ in lines} >= {"README.md", "eval/release/RELEASE.md", "eval/plans/HOWTO.md"}
+    assert sum(page.endswith(".ipynb") for page, _ in lines) > 10
     wrong = []
     for page, line in lines:
         try:

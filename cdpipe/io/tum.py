@@ -70,19 +70,20 @@ def motion_through(rows: Float64Array, first_s: float) -> Motion:
     return make_motion(rows[:, 0] - first_s, way_m, rows[:, 1:4], Rotation.from_quat(rows[:, 4:]))
 
 
-def motion_along(path: Path, first_ns: int, last_ns: int, slack_s: float) -> Motion:
-    """Return the movement of a TUM file, its time counted from `first_ns`.
+def motion_along(path: Path, first_ns: int, last_ns: int, slack_s: float, rows: Float64Array | None = None) -> Motion:
+    """Return the movement of a trajectory, its time counted from `first_ns`.
 
     Args:
-        path: The file; stamps in seconds of the same clock as `first_ns`.
+        path: The file, TUM unless its poses are given; stamps in seconds of the same clock as `first_ns`.
         first_ns: Time of the first column that needs a pose.
         last_ns: Time of the last one.
         slack_s: How far the poses may end short of either; there the movement goes on as it was.
+        rows: (N, 8) its rising stamps and poses, as a TUM file has them, where it is none.
 
     Raises:
         InputError: The file is not a trajectory, its stamps do not rise, or leave part of the time without poses.
     """
-    rows, numbers = read_trajectory(path)
+    rows, numbers = read_trajectory(path) if rows is None else (rows, tuple(range(1, len(rows) + 1)))
     steps_s = np.diff(rows[:, 0])
     time_s = rows[:, 0] - first_ns / 1e9
     length_s = (last_ns - first_ns) / 1e9

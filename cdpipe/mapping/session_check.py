@@ -54,7 +54,8 @@ def check_session(source: ScanSource, config: MapConfig, other: ScanSource | Non
         raise InputError(f"{source.name}: none of the scans that were looked at holds a return")
     ranges_m = np.linalg.norm(points, axis=1)
     _require_metres(source, ranges_m, other)
-    _require_up(source, points[ranges_m > 0] / ranges_m[ranges_m > 0, None], config.keyframe_spacing_m)
+    if not getattr(source, "is_whole_map", False):  # stations cast no beams
+        _require_up(source, points[ranges_m > 0] / ranges_m[ranges_m > 0, None], config.keyframe_spacing_m)
 
 
 def is_same_session(before: ScanSource, after: ScanSource) -> bool:

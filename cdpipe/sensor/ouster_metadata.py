@@ -27,6 +27,8 @@ _LARGEST_ENTRY = 1e5  # of a transform within a sensor, millimetres
 _LIDAR_TO_SENSOR_MM = (-1.0, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 36.18, 0, 0, 0, 1)
 # Four times what the largest sensor has; tables of its directions are made before any scan is read.
 _MOST_BEAMS, _MOST_COLUMNS = 512, 16_384
+# Of one beam: sessions made of bare points have a column for each of them.
+_MOST_RAYS = 262_144
 _BEAMS_OF_PRODUCT = re.compile(r"^OS-[0-9A-Za-z]+-(\d+)")
 
 
@@ -53,10 +55,10 @@ def parse_fields(document: Mapping[str, Any], source: str, mode: str | None = No
             )
     product = str(flat.get("prod_line", "unknown"))
     altitude_deg, azimuth_deg = _beams(flat, source, product)
-    own_mode = str(flat["lidar_mode"])
-    columns = _columns(mode or own_mode, source)
-    shift = _pixel_shift(document, source, len(altitude_deg), _columns(own_mode, source))
-    if shift is None or columns != _columns(own_mode, source):
+    own_mode, most = str(flat["lidar_mode"]), _MOST_RAYS if len(altitude_deg) == 1 else _MOST_COLUMNS
+    columns, own_columns = _columns(mode or own_mode, source, most), _columns(own_mode, source, most)
+    shift = _pixel_shift(document, source, len(altitude_deg), own_columns)
+    if shift is None or columns != own_columns:
         shift = np.round((azimuth_deg - azimuth_deg.min()) * columns / 360.0).astype(int).tolist()
     return {
         "product": product,
@@ -125,10 +127,10 @@ def _beams(flat: Mapping[str, Any], source: str, product: str) -> tuple[Float64A
     return altitude_deg, azimuth_deg
 
 
-def _columns(mode: str, source: str) -> int:
+def _columns(mode: str, source: str, most: int) -> int:
     columns, _, rate = mode.partition("x")
-    is_number = all(word.isdecimal() and len(word) < 6 for word in (columns, rate))
-    if not is_number or not 0 < int(columns) <= _MOST_COLUMNS or int(rate) == 0:
+    is_number = all(word.isdecimal() and len(word) < 7 for word in (columns, rate))
+    if not is_number or not 0 < int(columns) <= most or int(rate) == 0:
         raise InputError(f"{source}: lidar_mode = {mode!r:.40}: expected <columns>x<Hz>, one of {', '.join(MODES)}")
     return int(columns)
 

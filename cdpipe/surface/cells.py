@@ -31,7 +31,7 @@ _RANGE_M, _BEAM_RAD = 0.015, np.deg2rad(0.09)
 # place itself. Near returns therefore decide where there are any; a roof 3 m above the sensor is seen from 8 m on.
 _DRIFT = 0.01
 _REACH_M = 16.0
-_LEAST_RETURNS = 2
+_LEAST_RETURNS, _THINNED = 2, 0.05
 # At most so many scans are averaged at once, and so many points moved.
 _SCANS, _BLOCK = 16, 1 << 18
 _NO_KEYS = np.zeros(0, dtype=np.int64)
@@ -134,11 +134,16 @@ def _average_stretch(
 
 
 def make_cells(returns: NearReturns) -> SurfaceCells:
-    """Return the cells of a session. False returns lie alone: a cell of one return is left out."""
+    """Return the cells of a session. False returns lie alone: a cell of one return is left out.
+
+    In a map that was thinned before, nearly every cell holds one, and all are kept.
+    """
     n = int(returns.cell_of.max(initial=-1)) + 1
     group = returns.cell_of * N_FOLDS + np.floor(returns.path_m / _FOLD_M).astype(np.int64) % N_FOLDS
     values = (returns.weights, *(returns.weights * axis for axis in returns.points.T))
-    kept = np.bincount(returns.cell_of, returns.counts, n) >= _LEAST_RETURNS
+    counts = np.bincount(returns.cell_of, returns.counts, n)
+    is_thinned = np.count_nonzero(counts > 1) < _THINNED * n
+    kept = counts >= (1 if is_thinned else _LEAST_RETURNS)
     weights, *sums = in_threads(lambda each: np.bincount(group, each, n * N_FOLDS).reshape(n, N_FOLDS)[kept], values)
     points = np.stack([each.sum(axis=1) for each in sums], axis=1) / weights.sum(axis=1, keepdims=True)
     with np.errstate(invalid="ignore"):

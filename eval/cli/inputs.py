@@ -66,6 +66,39 @@ def how_to_read(
     ]
 
 
+def tell_recordings(
+    paths: Sequence[Path],
+    form: str | None,
+    topics: list[str] | None,
+    trajectory: list[str] | None,
+    odometry: str | None,
+    metadata: list[str] | None,
+    *,
+    deskew: bool,
+) -> dict[str, Any]:
+    """Return one or two recordings and how they are read, as keys of `scenarios.grafted.Recording`.
+
+    Raises:
+        InputError: None or more than two are named, or two options exclude each other.
+    """
+    from cdpipe.core.errors import InputError
+
+    if not 1 <= len(paths) <= 2:
+        raise InputError(
+            f"{len(paths)} recordings: expected one, which is split, two of one place, or --recording NAME"
+        )
+    hows = how_to_read(len(paths), form, topics, trajectory, odometry, metadata, deskew=deskew)
+    told: dict[str, Any] = {"sessions": [str(path) for path in paths], "format": form, "topics": list(topics or ())}
+    for name, option, files in (
+        ("trajectories", "trajectory", [how.trajectory for how in hows]),
+        ("metadata", "metadata", [how.metadata for how in hows]),
+    ):
+        if any(files) and not all(files):
+            raise InputError(f"--{option} -: a grafted pair takes a file for each of its recordings, or for none")
+        told[name] = [str(file) for file in files if file is not None]
+    return {**told, "odometry": odometry, "deskew": deskew}
+
+
 def open_inputs(paths: Sequence[Path], hows: Sequence[HowToRead], progress: RunProgress) -> list[Path | ScanSource]:
     """Open recordings; session folders stay paths.
 

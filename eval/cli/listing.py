@@ -11,6 +11,7 @@ from cdpipe.core.plugins import METHODS, METRICS, entry_points
 from cdpipe.core.yamlfile import read_yaml
 from cdpipe.model.config import preset_files, setting_fields
 from cdpipe.sensor.ouster import describe_profile, profile_names
+from eval.graft.adapters import list_adapters
 from eval.plans.files import plan_files, read_plan
 from scenarios import prop_names
 from scenarios.catalogue import family_files
@@ -103,6 +104,12 @@ def _limits(field: FieldInfo) -> list[Any]:
     return [each for each in field.metadata if type(each).__name__ in ("Ge", "Le")]
 
 
+def _recordings() -> Iterable[Entry]:
+    for name, adapter in list_adapters().items():
+        told = [adapter.description, f"licence: {adapter.licence}", adapter.url]
+        yield Entry(name, "; ".join([*told, *(["cannot be grafted"] if adapter.unreadable else [])]))
+
+
 def _one_line(text: object) -> str:
     """Return the first sentence of a text on one line."""
     words = " ".join(str(text or "").split())
@@ -122,5 +129,6 @@ _LISTED: dict[str, Callable[[], Iterable[Entry]]] = {
     "methods": _names(lambda: entry_points(METHODS)),
     "metrics": _names(lambda: entry_points(METRICS)),
     "sensors": lambda: (Entry(name, _one_line(describe_profile(name))) for name in profile_names()),
+    "recordings": _recordings,
     "settings": _settings,
 }

@@ -54,6 +54,12 @@ def _method_names() -> list[str]:
     return list(entry_points(METHODS))
 
 
+def _recording_names() -> list[str]:
+    from eval.graft.adapters import list_adapters
+
+    return list(list_adapters())
+
+
 def _setting_names() -> list[str]:
     from cdpipe.model.config import setting_fields
 
@@ -83,6 +89,7 @@ complete_preset = _completed(_preset_names)
 complete_setting = _completed(_setting_names)
 complete_method = _completed(lambda: sorted({*_method_names(), *_preset_names()}))
 complete_any = _completed(lambda: [*_scenario_names(), *_plan_names(), *_preset_names()])
+complete_recording = _completed(_recording_names)
 complete_release = _completed(_release_names)
 _complete_world = _completed(_world_names)
 

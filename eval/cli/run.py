@@ -3,9 +3,10 @@
 # ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -30,6 +31,8 @@ from eval.core.progress import shown_progress
 if TYPE_CHECKING:
     from eval.core.cluster import Where
     from eval.plans.plan import Plan
+    from eval.running.scaling.mirror import Mirror
+    from eval.running.scaling.shards import Shard
 
 
 def demo(out: RunOut, quiet: Quiet = False) -> None:
@@ -74,25 +77,69 @@ def run_command(
     limit: Annotated[int | None, typer.Option(min=1, help="compute at most this many cells")] = None,
     force: Annotated[bool, typer.Option("--force", help="compute finished cells again, simulation included")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="list the cells and which are finished; run none")] = False,
+    shard: Annotated[
+        str | None,
+        typer.Option(metavar="I/N", help="run every N-th pair, from the I-th on; `merge-runs` unites shards"),
+    ] = None,
+    keep: Annotated[
+        Literal["answers", "sessions", "nothing"] | None,
+        typer.Option(help="what stays of a pair after its last cell; of `nothing` rows do", show_default="sessions"),
+    ] = None,
+    rows_to: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="copy rows and answers there as well, and go on from those there"),
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Run a plan: scenarios x seeds x variants. Finished cells are kept."""
     from eval.core.cluster import Where, exposure, require_reachable, require_usable
     from eval.plans.changes import change_plan
     from eval.plans.plan import load_plan
+    from eval.running.scaling.shards import parse_shard
 
     require_method_settings([*(settings or ()), *(grid or ())], "write it into the plan, as `set` of a scenario")
     chosen = change_plan(
         load_plan(plan), seeds=seeds, split=split, presets=preset or (), settings=settings or (), grid=grid or ()
     )
-    where = Where(workers, scheduler)
+    where, part = Where(workers, scheduler), None if shard is None else parse_shard(shard)
     require_usable(where)
     if dry_run:
-        _list_cells(chosen, out, force=force, limit=limit)
-    else:
-        require_reachable(where)
-        warn(exposure(where))
-        _run(chosen, out, where, force=force, limit=limit, quiet=quiet)
+        _list_cells(chosen, out, force=force, limit=limit, shard=part)
+        return
+    require_reachable(where)
+    warn(exposure(where))
+    mirror = None if rows_to is None else _open_mirror(rows_to, out)
+    _run(chosen, out, where, force=force, limit=limit, shard=part, keep=keep, mirror=mirror, quiet=quiet)
+
+
+def merge_runs_command(
+    folders: Annotated[list[str], typer.Argument(metavar="RUN...", help="run folders of one plan, or URLs of rows")],
+    out: Annotated[Path, typer.Option("--out", help="run folder: new or empty", show_default=False)],
+    keep: Annotated[
+        Literal["answers", "sessions"], typer.Option(help="`answers`: leave sessions and maps behind")
+    ] = "sessions",
+    quiet: Quiet = False,
+) -> None:
+    """Unite the run folders of shards, or of parts of a plan, into one. A cell that two hold must be the same."""
+    from contextlib import ExitStack
+    from tempfile import TemporaryDirectory
+
+    from eval.running.scaling.merging import merge_runs
+    from eval.running.scaling.mirror import Mirror, is_url
+
+    with ExitStack() as stack, shown_progress(quiet, rate="cells") as progress:
+        places = []
+        for folder in folders:
+            places.append(Path(folder))
+            if is_url(folder):
+                places[-1] = Path(stack.enter_context(TemporaryDirectory(prefix="tunnelcd-")))
+                Mirror(folder).fetch_all(places[-1], progress)
+        found = merge_runs(places, out, command=_command(), keep=keep, names=folders, progress=progress)
+    for note in found.notes:
+        warn(note)
+    print_results(out, quiet)
+    shared = f", {found.n_shared} of them in several and equal" if found.n_shared else ""
+    say(quiet, f"{out}: {found.n_cells} cells of {len(folders)} runs{shared}")
 
 
 def score(
@@ -118,9 +165,11 @@ def score(
     if answer is not None:
         if predictions is not None:
             raise InputError("--predictions: goes with a run folder alone, not with one pair and its answer")
+        from eval.running.scaling.remaking import remade_below
         from eval.scoring.scoring import score
 
-        row = score(answer, folder)
+        with shown_progress(quiet) as progress, remade_below([folder], progress):
+            row = score(answer, folder)
         tell_json(row, as_json=as_json, file=out)
         if not as_json and not quiet:
             print_row(row)
@@ -217,7 +266,10 @@ def report(
 
         if out is not None:
             raise InputError("--out: the page of a run lies in its folder: leave --out to a comparison")
-        echo(f"page: {write_page(open_run_folder(Path(folder)).path, views, is_slim=slim, keeps=keep)}")
+        run = open_run_folder(Path(folder))
+        with shown_progress(quiet) as progress:
+            page = write_page(run.path, views, is_slim=slim, keeps=keep, progress=progress)
+        echo(f"page: {page}")
         return
     if not slim:
         raise InputError("--sharp: the page of a comparison has no pictures to compress: leave it out")
@@ -235,12 +287,12 @@ def report(
     echo(f"page: {page}")
 
 
-def _list_cells(plan: Plan, out: Path, *, force: bool, limit: int | None) -> None:
+def _list_cells(plan: Plan, out: Path, *, force: bool, limit: int | None, shard: Shard | None) -> None:
     from collections import Counter
 
     from eval.running.runner import list_cells
 
-    every = list_cells(plan, out, force=force, limit=limit)
+    every = list_cells(plan, out, force=force, limit=limit, shard=shard)
     for cell, state in every:
         echo(f"{state:<8}  {cell.scenario} {cell.seed} {cell.variant}")
     count = Counter(state for _, state in every)
@@ -248,16 +300,32 @@ def _list_cells(plan: Plan, out: Path, *, force: bool, limit: int | None) -> Non
     echo(f"{out}: {len(every)} cells: {count['finished']} finished, {count['to do']} to do{left}; nothing was run")
 
 
-def _run(plan: Plan, out: Path, where: Where, *, force: bool, limit: int | None, quiet: bool) -> None:
+def _command() -> str:
+    return shlex.join(["tunnelcd", *sys.argv[1:]])
+
+
+def _open_mirror(url: str, out: Path) -> Mirror:
+    from cdpipe.core.errors import InputError
+    from eval.running.scaling.mirror import Mirror, is_url
+
+    place = url.removeprefix("file://")
+    if not is_url(place) and Path(place).resolve() == out.resolve():
+        raise InputError(f"--rows-to {url}: is the run folder itself: name another place")
+    return Mirror(url)
+
+
+def _run(plan: Plan, out: Path, where: Where, *, quiet: bool, **options: Any) -> None:
     from eval.plans.plan import expand_cells
     from eval.running.runfolder import removed_if_empty, start_run_folder
     from eval.running.runner import run_plan
+    from eval.running.scaling.shards import choose_cells
 
-    expand_cells(plan)  # raises where settings contradict each other, before a folder is made
+    # raises where settings contradict each other, or there are too many shards, before a folder is made
+    choose_cells(expand_cells(plan), options.get("shard"))
     command = ["tunnelcd", *sys.argv[1:]]
     with removed_if_empty(out), shown_progress(quiet, rate="cells") as progress:
         run = start_run_folder(out)
-        outcome = run_plan(plan, run, command=command, force=force, limit=limit, where=where, progress=progress)
+        outcome = run_plan(plan, run, command=command, where=where, progress=progress, **options)
     print_results(out, quiet)
     left = f", {outcome.n_left} left by --limit" if outcome.n_left else ""
     died = f", {outcome.n_died} of all killed their workers" if outcome.n_died else ""

@@ -118,7 +118,8 @@ def _with_files(told: str, written: list[Path]) -> str:
 
 def list_command(
     what: Annotated[
-        Literal["scenarios", "props", "plans", "presets", "methods", "metrics", "sensors", "settings"] | None,
+        Literal["scenarios", "props", "plans", "presets", "methods", "metrics", "sensors", "recordings", "settings"]
+        | None,
         typer.Argument(help="this alone, with one-line descriptions; of settings with default and unit"),
     ] = None,
     as_json: AsJson = False,
@@ -155,6 +156,7 @@ _TITLES = {
     "methods": "methods",
     "metrics": "metrics of plugins",
     "sensors": "sensor profiles",
+    "recordings": "public recordings",
 }
 
 

@@ -3,14 +3,16 @@
 # ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from eval.cli.inputs import (
+    RECORDING,
     Deskew,
     Format,
     Metadata,
@@ -21,6 +23,7 @@ from eval.cli.inputs import (
     open_inputs,
     open_sources,
     sampled_points,
+    tell_recordings,
 )
 from eval.cli.options import (
     Families,
@@ -28,6 +31,7 @@ from eval.cli.options import (
     OutFolder,
     Quiet,
     WorldSettings,
+    complete_recording,
     complete_scenario,
     join_world_settings,
     world_mistakes,
@@ -56,19 +60,86 @@ def simulate(
 ) -> None:
     """Simulate one pair of sessions with truth: DIR/before, DIR/after, DIR/truth."""
     from eval.core.output import new_folder
+    from eval.graft import make_pair
     from scenarios import load_scenario
-    from sim.session.simulate import simulate_pair
     from sim.story import simulate_story
 
     with world_mistakes():
         drawn = load_scenario(scenario, seed, join_world_settings(world, settings))
-    with new_folder(out) as partial, shown_progress(quiet) as progress:
+    with shown_warnings(), new_folder(out) as partial, shown_progress(quiet) as progress:
         if sessions == 2:
-            simulate_pair(drawn, seed, partial, on_progress=progress.stage)
+            make_pair(drawn, seed, partial, progress.stage)
         else:
             simulate_story(drawn, seed, sessions, partial, on_progress=progress.stage)
     told = "before, after, truth" if sessions == 2 else f"{sessions} sessions and story.json"
     say(quiet, f"{out}: {told} of {scenario}, seed {seed}")
+
+
+def graft(
+    out: OutFolder,
+    recordings: Annotated[
+        list[Path] | None, typer.Argument(metavar="SESSION [SESSION2]", help=RECORDING, show_default=False)
+    ] = None,
+    objects: Annotated[
+        str,
+        typer.Option(
+            "--objects",
+            help="props: a scenario's name or .yaml file; none: a real pair without changes",
+            autocompletion=complete_scenario,
+        ),
+    ] = "none",
+    seed: Annotated[int, typer.Option(min=0, help="seed of the props, their places and all noise")] = 0,
+    split: Annotated[
+        Literal["auto", "passes", "halves", "alternate"],
+        typer.Option(help="of one recording; auto: two passes of one way, else every other revolution"),
+    ] = "auto",
+    before_T_after: Annotated[
+        Path | None,
+        typer.Option(
+            "--before-T-after", metavar="FILE", help="merge of two recordings; else tunnelcd's", show_default=False
+        ),
+    ] = None,
+    recording: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="public recording, see `list recordings`",
+            show_default=False,
+            autocompletion=complete_recording,
+        ),
+    ] = None,
+    root: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="folder with the files of --recording", show_default=False)
+    ] = None,
+    clearance_m: Annotated[float, typer.Option("--clearance", min=0.1, help="m from the path to a prop")] = 0.8,
+    reach_m: Annotated[float, typer.Option("--reach", min=1, help="m from the path within which props stand")] = 10.0,
+    form: Format = None,
+    topics: Topics = None,
+    trajectory: Trajectories = None,
+    odometry: Odometry = None,
+    metadata: Metadata = None,
+    deskew: Deskew = True,
+    quiet: Quiet = False,
+) -> None:
+    """Cast props into the scans of real recordings: DIR/before, DIR/after, and DIR/truth as `simulate` writes it."""
+    from eval.graft.adapters import locate_recording
+    from eval.graft.making import make_pair
+    from eval.graft.telling import tell_pair
+    from scenarios.library import load_grafted
+    from sim.session.truth import read_pair_truth
+
+    public = {} if recording is None else locate_recording(recording, root)
+    paths = [*(recordings or []), *(Path(name) for name in public.get("sessions", ()))]
+    told = tell_recordings(paths, form, topics, trajectory, odometry, metadata, deskew=deskew)
+    for name in ("format", "topics", *(() if trajectory else ("odometry",))):
+        told[name] = told[name] or public.get(name, told[name])  # what is said on the command line holds
+    told |= {"split": split, "clearance_m": clearance_m, "reach_m": reach_m}
+    told |= {} if before_T_after is None else {"before_T_after": str(before_T_after)}
+    drawn = load_grafted(objects, told, seed)
+    with shown_warnings(), shown_progress(quiet) as progress:
+        make_pair(drawn, seed, out, progress.stage)
+    if not quiet:
+        echo(f"{out}: before, after, truth; props of {objects}, seed {seed}", *tell_pair(read_pair_truth(out)))
 
 
 def survey(
@@ -146,13 +217,43 @@ def view(
         raise InputError(f"--html {html}: there is no folder {html.parent}: make it, or name another one")
     asked = join_world_settings(world, settings)
     hows = how_to_read(1 if after is None else 2, form, topics, trajectory, odometry, metadata, deskew=deskew)
-    if after is not None:
-        _view_answer(_require_answer(what, after, answer, seed, asked), hows, port, host, html, quiet)
+    with _sessions_at_hand([Path(what), *([] if after is None else [after])], quiet):
+        if after is not None:
+            _view_answer(_require_answer(what, after, answer, seed, asked), hows, port, host, html, quiet)
+        else:
+            _view_one(what, seed, asked, hows[0], port, host, html, quiet)
+
+
+@contextmanager
+def _sessions_at_hand(paths: Sequence[Path], quiet: bool) -> Iterator[None]:
+    """Make sessions again that `run --keep` removed from a run folder, for the time of the block."""
+    if all(path.exists() or path.parent == Path() for path in paths):
+        yield
         return
+    from eval.running.scaling.remaking import remade_below
+
+    with ExitStack() as stack:
+        with shown_progress(quiet) as progress:
+            stack.enter_context(remade_below(paths, progress))
+        yield
+
+
+def _view_one(
+    what: str,
+    seed: int | None,
+    settings: Sequence[str],
+    how: HowToRead,
+    port: int,
+    host: str,
+    html: Path | None,
+    quiet: bool,
+) -> None:
+    from cdpipe.core.errors import InputError
+
     if (Path(what) / "answer.json").is_file():
         raise InputError(f"{what}: an answer, without its sessions: `tunnelcd view BEFORE AFTER {what}`")
     _require_viser_for(host, port, html)
-    load = partial(_load_with_progress, what, seed, asked, hows[0], quiet=quiet)
+    load = partial(_load_with_progress, what, seed, settings, how, quiet=quiet)
     if html is None:
         _serve(load, what, port, host, quiet)
         return

@@ -29,7 +29,20 @@ _OTHER_PACKAGES = ("ouster-sdk", "viser")
 
 def digest(value: Any) -> str:
     """Return a short digest of anything JSON can hold; the order of keys does not matter."""
-    text = json.dumps(value, sort_keys=True, separators=(",", ":"))
+    return _digest_text(canonical_json(value))
+
+
+def canonical_json(value: Any) -> str:
+    """Return the text that `digest` is of."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+
+
+def digest_parts(parts: Mapping[str, str]) -> str:
+    """Return the digest of a mapping whose values are canonical JSON already, equal to that of the mapping itself."""
+    return _digest_text("{" + ",".join(f"{json.dumps(name)}:{parts[name]}" for name in sorted(parts)) + "}")
+
+
+def _digest_text(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

@@ -13,6 +13,8 @@ from cdpipe.core.ranking import auroc, average_precision
 
 Statistic = Literal["mean", "median"]
 N_RESAMPLES = 2000
+# From here on a mean is a product of counts, five times as fast as a gathered sample and equal but for rounding.
+MANY_PAIRS = 5000
 # sign test: six pairs agree by chance in 2^(1-6) = 3 % of cases, five in 6 %
 ENOUGH_PAIRS = 6
 _NORMAL_95 = 1.959963984540054
@@ -85,6 +87,9 @@ def bootstrap_interval(values: Float64Array, statistic: Statistic = "mean", seed
     """
     if np.count_nonzero(~np.isnan(values)) < 2:
         return float("nan"), float("nan")
+    if statistic == "mean" and len(values) > MANY_PAIRS:
+        counts, is_number = _draw_counts(seed, len(values)), ~np.isnan(values)
+        return interval_of((counts @ np.where(is_number, values, 0.0)) / (counts @ is_number.astype(np.float64)))
     samples = values[_draws(seed, len(values))]
     if np.isnan(values).any():
         samples = samples[~np.isnan(samples).all(axis=1)]
@@ -98,6 +103,12 @@ def bootstrap_interval(values: Float64Array, statistic: Statistic = "mean", seed
 def _draws(seed: int, n: int) -> Int64Array:
     """Return the (N_RESAMPLES, n) pairs that each bootstrap sample draws; a table asks for the same ones many times."""
     return stream(seed, "bootstrap").integers(n, size=(N_RESAMPLES, n))
+
+
+@lru_cache(maxsize=1)
+def _draw_counts(seed: int, n: int) -> Float64Array:
+    """Return (N_RESAMPLES, n) how often each bootstrap sample of `_draws` draws each pair."""
+    return np.stack([np.bincount(drawn, minlength=n) for drawn in _draws(seed, n)]).astype(np.float64)
 
 
 def interval_of(samples: Float64Array) -> tuple[float, float]:

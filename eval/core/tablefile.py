@@ -1,4 +1,7 @@
-"""Where a table is stored, NAME.csv or NAME.csv.xz in a report that is kept small, and how it is read."""
+"""Where a table is stored, and how it is written and read.
+
+NAME.csv, NAME.csv.xz in a report that is kept small, and NAME.parquet beside a large NAME.csv or in its place.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,8 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_bytes
+from eval.core.output import whole_file
+from eval.core.parquet import parquet_folder, read_parquet, write_parquet
 
 # xz shrinks a constant column ten thousandfold: what a file may expand to is bounded by its own size.
 _SMALL_BYTES = 64_000_000
@@ -26,27 +31,39 @@ def table_file(path: Path) -> Path:
         path: Path of the table as a run writes it, NAME.csv.
 
     Returns:
-        NAME.csv.xz where only that file is there, `path` otherwise.
+        NAME.csv.xz or NAME.parquet where only that is there, `path` otherwise.
     """
-    compressed = path.with_name(f"{path.name}.xz")
-    return compressed if compressed.is_file() and not path.is_file() else path
+    if path.is_file():
+        return path
+    compressed, folder = path.with_name(f"{path.name}.xz"), parquet_folder(path)
+    return compressed if compressed.is_file() else folder if folder.is_dir() else path
 
 
-def read_table(path: Path, *, low_memory: bool = True) -> pd.DataFrame:
-    """Read a table, NAME.csv or NAME.csv.xz; one without a column gives an empty frame.
+def write_rows(path: Path, frame: pd.DataFrame) -> None:
+    """Write a table of rows, NAME.csv, and its Parquet where it is large. Each appears whole or not at all."""
+    write_parquet(path, frame[:0])  # none stands beside another CSV
+    with whole_file(path) as partial:
+        frame.to_csv(partial, index=False)
+    write_parquet(path, frame)
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """Read a table, NAME.csv, NAME.csv.xz or NAME.parquet; one without a column gives an empty frame.
 
     Args:
-        path: The file.
-        low_memory: Whether pandas guesses the type of a column part by part.
+        path: The file. The type of a column is that of all of its values.
 
     Raises:
         InputError: It is missing, or no table.
     """
-    content = read_bytes(path, expected="expected a table written by `tunnelcd`")
+    if path.is_dir():
+        content = read_parquet(path)
+    else:
+        content = read_bytes(path, expected="expected a table written by `tunnelcd`")
     try:
         if path.suffix == ".xz":
             content = _decompress(content)
-        return pd.read_csv(io.BytesIO(content), low_memory=low_memory)
+        return pd.read_csv(io.BytesIO(content), low_memory=False)
     except pd.errors.EmptyDataError:
         return pd.DataFrame()
     except Exception as error:  # the parser of pandas lets through whatever a damaged file provokes

@@ -37,10 +37,10 @@ from eval.leaderboard.command import digest_programs, run_command
 from eval.leaderboard.given_merge import MergeMode, write_merge
 from eval.plans.plan import Plan
 from eval.plans.worlds import world_slug
+from eval.running.cell_file import LAST, NO_KEY, cell_document
 from eval.running.export import copy_pair
 from eval.running.pair_run import TOOLS, Pair, Tools, pair_lock, score_unmade
 from eval.running.predictions import require_current_scores, require_free_name
-from eval.running.rescoring import LAST, NO_KEY, cell_document
 from eval.running.runfolder import RunFolder, write_json, write_tables
 from eval.running.runner import list_plan_pairs, open_pair, start_provenance
 from eval.running.stages import PairStages

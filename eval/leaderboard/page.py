@@ -106,8 +106,9 @@ def _make_board(group: Sequence[CheckedFile], reference: Path | None) -> Board:
     pairs = own[first.name].index
     rows = [(summarise_figures(name, found), _MERGES[each.content.merge], False)
             for (name, found), each in zip(own.items(), group, strict=True)]  # fmt: skip
-    for name, found in _list_references(data, pairs):
-        rows.append((summarise_figures(name, found), "", True))
+    # a run in which a method was evaluated holds its rows, too
+    references = [(name, found) for name, found in _list_references(data, pairs) if name not in own]
+    rows += [(summarise_figures(name, found), "", True) for name, found in references]
     rows.sort(key=lambda row: -_rank(row[0]["object_iou_point"]))
     title = f"Plan {first.plan}, {count_pairs(len(pairs))}{f', {first.split}' if first.split else ''}"
     return Board(title, tuple(_line(*row) for row in rows), tuple(_notes(group, data, len(pairs), rows)))

@@ -31,7 +31,7 @@ def find_reference(plan: str, folder: Path | None) -> RunData | None:
     """
     own = [plan] if path_part(plan) == plan else []  # the name may come from a file of others
     places = [REPORTS / name for name in own] if folder is None else [folder, *(folder / name for name in own)]
-    found = next((place for place in places if table_file(place / "results.csv").is_file()), None)
+    found = next((place for place in places if table_file(place / "results.csv").exists()), None)
     if found is None:
         if folder is None:
             return None

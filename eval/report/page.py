@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.model.config import settings_table
 from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.core.output import require_no_links
+from eval.core.progress import RunProgress
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.targets import read_targets
 from eval.report.cost import draw_pareto, pareto_table
@@ -61,6 +63,7 @@ from eval.running.run_data import (
     text,
 )
 from eval.running.runfolder import read_json
+from eval.running.scaling.remaking import remade_when_asked
 from eval.running.sides import Side, check_extras, check_versions, is_contended
 from eval.tables.columns import RESULT_COLUMNS, TIME_MEANINGS, UNDEFINED
 from eval.tables.merge_table import merge_table
@@ -71,7 +74,14 @@ POINT_COLOURS = (
 )  # fmt: skip
 
 
-def write_page(run: Path, views: Views = "chosen", *, is_slim: bool = True, keeps: bool = False) -> Path:
+def write_page(
+    run: Path,
+    views: Views = "chosen",
+    *,
+    is_slim: bool = True,
+    keeps: bool = False,
+    progress: RunProgress | None = None,
+) -> Path:
     """Write `index.html` and the tables table1, table2 (.csv, .tex), results.tex and summary.tex into a run folder.
 
     Further files: regions_table.tex and objects_table.tex where the tables exist, pareto.csv and its pictures where
@@ -84,6 +94,7 @@ def write_page(run: Path, views: Views = "chosen", *, is_slim: bool = True, keep
             that is to stand without them.
         is_slim: Whether pictures are compressed: fewer pixels, edges a little blurred, a quarter of the bytes.
         keeps: Whether pictures and tables of the page that lies there are kept where the folder cannot make them.
+        progress: Told of pairs that are made again for their pictures, unless `views` is "none".
 
     Returns:
         Path of the page.
@@ -97,7 +108,9 @@ def write_page(run: Path, views: Views = "chosen", *, is_slim: bool = True, keep
     check_versions(Side(data), Side(data))
     check_extras(Side(data))
     try:
-        files = _draw(data, views, read_kept(run / "index.html") if keeps else KeptPage(), is_slim=is_slim)
+        kept = read_kept(run / "index.html") if keeps else KeptPage()
+        with remade_when_asked(data.folder, progress, is_wanted=views != "none") as folder:
+            files = _draw(replace(data, folder=folder), views, kept, is_slim=is_slim)
     except KeyError as error:
         raise InputError(
             f"{run}: a table lacks column {error}: `tunnelcd score {run}` makes the tables anew"

@@ -30,6 +30,7 @@ from eval.core.output import make_writable, new_folder
 from eval.core.progress import RunProgress, Silent
 from eval.running.rescoring import foreign_identity
 from eval.running.runfolder import RunFolder, write_json
+from eval.running.scaling.keeping import list_dropped
 from sim.session.truth import SESSIONS
 
 TIME_S = 315_532_800
@@ -94,8 +95,13 @@ def list_pairs(run: RunFolder) -> list[Path]:
     """Return the folders of the simulated pairs of a run.
 
     Raises:
-        InputError: There are none.
+        InputError: There are none, or the sessions of some were removed.
     """
+    if dropped := list_dropped(run):
+        raise InputError(
+            f"{run.path}: the sessions of {len(dropped)} pairs were removed: `tunnelcd run PLAN --out {run.path} "
+            "--keep sessions` makes them again"
+        )
     pairs = [path.parents[1] for path in sorted(run.path.glob(f"pairs/*/*/{_CHANGES}"))]
     if not pairs:
         raise InputError(f"{run.path}: holds no simulated pairs: run the plan again, which makes them")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,20 +27,22 @@ from cdpipe.pipeline import OnStage
 from eval.core.domains import domain_of
 from eval.core.output import remove, whole_file
 from eval.core.progress import RunProgress
-from eval.core.provenance import digest, git_commit, now
+from eval.core.provenance import canonical_json, digest_parts, git_commit, now
+from eval.graft import make_pair
 from eval.oracles.merge import merged_by_truth
 from eval.oracles.regions import regions_by_truth
 from eval.plans.variants import Cell
-from eval.running.rescoring import cell_document
+from eval.running.cell_file import cell_document
 from eval.running.runfolder import RunFolder, write_json
+from eval.running.scaling.keeping import Keep, dropped_file, read_dropped, require_same_bytes
 from eval.running.stage_cache import open_cache
 from eval.running.stages import PairStages
 from eval.scoring.scoring import METRICS_VERSION, CaseScore, describe_recording, score_stored
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
+from scenarios.grafted import GraftScenario
 from scenarios.library import load_scenario
 from scenarios.schema import Scenario
-from sim.session.simulate import simulate_pair
 
 if sys.platform != "win32":
     import fcntl
@@ -66,16 +68,18 @@ class Pair:
         kind: What the plan calls such pairs, or "".
         scenario: The drawn scenario; None where the seed draws none, and `error` says why.
         files: Digests of the files that the scenario names.
+        keep: What stays of it after its last cell.
     """
 
     name: str
     family: str
     kind: str
     seed: int
-    scenario: Scenario | None
+    scenario: GraftScenario | Scenario | None
     files: Mapping[str, str]
     error: str
     todo: tuple[Todo, ...]
+    keep: Keep = "sessions"
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +102,7 @@ class Tools:
     """
 
     draw: Callable[[str, int, tuple[str, ...]], Scenario] = load_scenario
-    simulate: Callable[[Scenario, int, Path, OnStage], None] = simulate_pair
+    simulate: Callable[[Scenario, int, Path, OnStage], None] = make_pair
     commit: Callable[[], str | None] = git_commit
     now: Callable[[], str] = now
 
@@ -196,13 +200,18 @@ def is_finished(run: RunFolder, each: Todo) -> bool:
     return bool(stored["key"] == each.key and stored["row"].get("metrics_version") == METRICS_VERSION)
 
 
+def pair_lock(run: RunFolder, pair: Pair) -> AbstractContextManager[None]:
+    """Hold the lock of a pair, as `pair_lock_of` does."""
+    return pair_lock_of(run, pair.name, pair.seed)
+
+
 @contextmanager
-def pair_lock(run: RunFolder, pair: Pair) -> Iterator[None]:
+def pair_lock_of(run: RunFolder, world: str, seed: int) -> Iterator[None]:
     """Hold the lock of a pair, waiting for it; the system releases it when the process dies."""
     if sys.platform == "win32":
         yield
         return
-    path = run.pair(pair.name, pair.seed).with_name(f".{pair.seed}.lock")
+    path = run.pair(world, seed).with_name(f".{seed}.lock")
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a") as file:
@@ -219,29 +228,52 @@ def pair_lock(run: RunFolder, pair: Pair) -> Iterator[None]:
 
 def cell_key(cell: Cell, pair_kind: str, scenario: Scenario | None, files: Mapping[str, str]) -> str:
     """Return the digest of everything that a cell depends on, the metrics version apart."""
+    return CellKeys().of_pair(cell.seed, pair_kind, scenario, files)(cell)
+
+
+class CellKeys:
+    """Makes the digests of cells. What the cells of a pair, or those of a method, share is written as JSON once."""
+
+    def __init__(self) -> None:
+        # the settings are held beside their text, so that no other settings get their id
+        self._methods: dict[tuple[object, ...], tuple[Cell, Mapping[str, str]]] = {}
+
+    def of_pair(
+        self, seed: int, pair_kind: str, scenario: Scenario | None, files: Mapping[str, str]
+    ) -> Callable[[Cell], str]:
+        """Return the function that gives the digest of each cell of a pair."""
+        drawn = None if scenario is None else scenario.model_dump(mode="json")
+        shared = {"scenario": drawn, "files": dict(files), "seed": seed, "pair_kind": pair_kind}
+        texts = {name: canonical_json(value) for name, value in shared.items()}
+        return lambda cell: digest_parts({**texts, **self._of_method(cell)})
+
+    def _of_method(self, cell: Cell) -> Mapping[str, str]:
+        name = (id(cell.config), id(cell.oracle), cell.until, cell.oracle_regions)
+        if name not in self._methods:
+            texts = {key: canonical_json(value) for key, value in _describe_method(cell).items()}
+            self._methods[name] = cell, texts
+        return self._methods[name][1]
+
+
+def _describe_method(cell: Cell) -> dict[str, object]:
+    """Return what a cell depends on beside its pair."""
     merge = cell.config.merge
     asks_kiss_matcher = merge.method == "kiss-matcher" or (merge.method == "voting" and merge.fallback)
     extras = ["kiss-matcher"] if cell.oracle is None and asks_kiss_matcher else []
     if cell.config.regions.source in PACKAGES and cell.until is None and not cell.oracle_regions:
         extras.append(PACKAGES[cell.config.regions.source])
     weights = list_checkpoints(cell.config)
-    return digest(
-        {
-            "scenario": None if scenario is None else scenario.model_dump(mode="json"),
-            "files": dict(files),
-            "seed": cell.seed,
-            # the digests name the weights, wherever their files lie
-            "config": cell.config.model_dump(mode="json", exclude=_WEIGHTS),
-            "checkpoint": checkpoint_digest(cell.config.descriptor),
-            **{name: found for name, found in weights.items() if name == cell.config.regions.source},
-            "oracle": None if cell.oracle is None else cell.oracle.model_dump(mode="json"),
-            **({"oracle_regions": True} if cell.oracle_regions else {}),
-            "until": cell.until,
-            "pair_kind": pair_kind,
-            # a cell that may depend on an extra runs again with another version of it, or without it
-            **({"extras": {name: extra_version(name) for name in extras}} if extras else {}),
-        }
-    )
+    return {
+        # the digests name the weights, wherever their files lie
+        "config": cell.config.model_dump(mode="json", exclude=_WEIGHTS),
+        "checkpoint": checkpoint_digest(cell.config.descriptor),
+        **{name: found for name, found in weights.items() if name == cell.config.regions.source},
+        "oracle": None if cell.oracle is None else cell.oracle.model_dump(mode="json"),
+        **({"oracle_regions": True} if cell.oracle_regions else {}),
+        "until": cell.until,
+        # a cell that may depend on an extra runs again with another version of it, or without it
+        **({"extras": {name: extra_version(name) for name in extras}} if extras else {}),
+    }
 
 
 def _open(
@@ -259,17 +291,24 @@ def _open(
     if not path.exists():
         remove(kept)  # of an earlier simulation
         path.parent.mkdir(parents=True, exist_ok=True)
+        record = read_dropped(dropped_file(run, pair.name, pair.seed))
         tools.simulate(pair.scenario, pair.seed, path, progress.stage)
+        if record is not None:
+            try:
+                require_same_bytes(record, path)
+            except InputError:
+                remove(path)
+                raise
     cache = open_cache(kept, (path / "before", path / "after"))
     sessions = pipeline_input(path, "before"), pipeline_input(path, "after")
     stages = PairStages(*sessions, progress.stage, cache, is_shared=made.is_contended)
     picture = run.maps(pair.name, pair.seed)
-    if not picture.exists():
-        _write_maps(picture, stages)
+    if pair.keep == "sessions" and not picture.exists():
+        write_maps(picture, stages)
     return stages, load_ground_truth(path)
 
 
-def _write_maps(path: Path, stages: PairStages) -> None:
+def write_maps(path: Path, stages: PairStages) -> None:
     """Write the points of both maps for the page, with the recorded poses: answers are in their frames."""
     try:
         before, after = stages.maps(MapConfig())

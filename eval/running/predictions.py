@@ -27,8 +27,9 @@ from eval.core.progress import RunProgress, Silent
 from eval.core.tablefile import read_table
 from eval.plans.coverage import read_stored_plan
 from eval.plans.plan import list_planned_cases
+from eval.running.cell_file import LAST, NO_KEY, cell_document
 from eval.running.export import copy_pair, list_pairs, list_pairs_blindly, name_blindly
-from eval.running.rescoring import LAST, NO_KEY, cell_document, foreign_identity
+from eval.running.rescoring import foreign_identity
 from eval.running.runfolder import RunFolder, open_run_folder, write_json, write_tables
 from eval.running.sides import list_versions
 from eval.scoring.scoring import METRICS_VERSION, score_stored
@@ -213,7 +214,7 @@ def require_current_scores(run: RunFolder) -> None:
     Raises:
         InputError: It was.
     """
-    others = list_versions(cell["row"] for cell in run.finished_cells()) - {str(METRICS_VERSION)}
+    others = list_versions(cell["row"] for cell in run.each_cell()) - {str(METRICS_VERSION)}
     if others:
         told = " and ".join(sorted(others))
         raise InputError(

@@ -2,58 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import parse_json
 from cdpipe.core.names import require_table_name, visible
 from eval.core.progress import RunProgress, Silent
-from eval.core.provenance import FORMAT_VERSION
-from eval.running.runfolder import (
-    IDENTITY,
-    ITEM_TABLES,
-    SURFACE_TABLES,
-    RunFolder,
-    json_text,
-    write_json,
-    write_tables,
-)
-from eval.scoring.scoring import CaseScore, score_stored
+from eval.running.cell_file import LAST, NO_KEY, cell_document
+from eval.running.cell_rows import IDENTITY
+from eval.running.runfolder import RunFolder, write_json, write_tables
+from eval.running.scaling.keeping import list_dropped
+from eval.running.scaling.remaking import remade_below
+from eval.scoring.scoring import score_stored
 from eval.truth.ground_truth import load_ground_truth
-
-# key and position of a cell of another program: its rows come last
-NO_KEY, LAST = "", (1_000_000, 1_000_000)
-
-
-def cell_document(score: CaseScore, identity: Mapping[str, Any], key: str, place: Sequence[int]) -> dict[str, Any]:
-    """Return the content of a cell; each item carries the columns that identify its row of results.csv.
-
-    Args:
-        score: Its scores.
-        identity: scenario, seed, variant, preset, pair_kind and commit; they replace the answer's own names.
-        key: Digest of everything that the cell depends on.
-        place: Position of its rows in the tables: scenario, variant.
-
-    Raises:
-        InputError: It is larger than what is read again.
-    """
-    names = {name: identity[name] for name in IDENTITY}
-    items = {table: [{**names, **item} for item in getattr(score, table)] for table in ITEM_TABLES}
-    items |= {
-        table: [{**names, **item} for item in rows] for table in SURFACE_TABLES if (rows := getattr(score, table))
-    }
-    head = {"format_version": FORMAT_VERSION, "key": key, "order": list(place)}
-    document = {**head, "row": {**score.row, **identity}, **items}
-    try:
-        parse_json(json_text(document))
-    except ValueError as error:
-        told = ", ".join(f"{len(rows)} {table}" for table, rows in items.items() if rows)
-        case = "{scenario} {seed} {variant}".format(**identity)
-        raise InputError(f"{case}: its scores are {error} ({told}): answer with fewer regions or objects") from error
-    return document
 
 
 def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
@@ -70,10 +33,15 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
     """
     progress = progress or Silent()
     folders = sorted(file.parent for file in run.path.glob("answers/*/*/*/answer.json"))
+    if not folders and list_dropped(run):
+        raise InputError(f"{run.path}: `run --keep nothing` left rows alone: run the plan again with --force")
     documents: dict[Path, dict[str, Any]] = {}
     place: Sequence[int]
     for (slug, seed), group in groupby(folders, key=lambda folder: folder.parts[-3:-1]):
-        truth = load_ground_truth(run.path / "pairs" / slug / seed)
+        # sessions that were removed are made again, one pair at a time
+        pair = run.path / "pairs" / slug / seed
+        with remade_below([pair], progress):
+            truth = load_ground_truth(pair)
         for folder in group:
             path = run.path / "cells" / slug / seed / f"{folder.name}.json"
             stored = run.read_cell(path)

@@ -19,7 +19,8 @@ from eval.core.tablefile import read_table, table_file
 from eval.plans.coverage import Coverage, measure_coverage
 from eval.plans.targets import read_targets
 from eval.plans.worlds import find_references, is_other_odometry
-from eval.running.runfolder import TEXT_COLUMNS, RunFolder, read_json
+from eval.running.cell_rows import TEXT_COLUMNS
+from eval.running.runfolder import RunFolder, read_json
 from eval.tables.conditions import COLUMNS as CONDITION_COLUMNS
 from eval.tables.conditions import Condition, by_condition, of_condition
 from eval.tables.rows import records, with_domain
@@ -99,7 +100,7 @@ def read_run(run: Path) -> RunData:
         InputError: There is no results.csv, it holds no row, lacks a column that names its rows, or one of them twice.
     """
     path = table_file(run / "results.csv")
-    if not path.is_file():
+    if not path.exists():
         raise InputError(f"{path}: missing: name a folder made by `tunnelcd run` or `tunnelcd demo`")
     left_out: list[str] = []
     results = _rows(path, left_out)
@@ -112,7 +113,7 @@ def read_run(run: Path) -> RunData:
     missing = []
     items: dict[str, tuple[Row, ...]] = {"changes": (), "regions": ()}
     for name in items:
-        if (path := table_file(run / f"{name}.csv")).is_file():
+        if (path := table_file(run / f"{name}.csv")).exists():
             items[name] = _rows(path, left_out)
         else:
             missing.append(f"{path.name} is not in the run folder: what it would show is left out.")
@@ -132,7 +133,7 @@ def stored_table(data: RunData, name: str) -> pd.DataFrame:
         InputError: A column of numbers holds text, or a count is missing.
     """
     path = table_file(data.folder.path / f"{name}.csv")
-    if not path.is_file():
+    if not path.exists():
         return pd.DataFrame()
     frame = read_table(path)
     _require_numbers(path, frame, {*_DERIVED_TEXTS, *_MORE_TEXTS.get(name, ())})

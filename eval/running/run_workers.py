@@ -13,7 +13,7 @@ import socket
 import time
 import uuid
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +27,7 @@ from eval.core.cluster import is_shared, n_slots
 from eval.core.progress import RunProgress, Silent
 from eval.running.pair_run import Made, Pair, PairRun, Todo, cell_key, is_finished, pair_lock
 from eval.running.runfolder import RunFolder
+from eval.running.scaling.keeping import drop_pair
 from eval.scoring.scoring import METRICS_VERSION
 from scenarios.references import file_digests
 
@@ -55,8 +56,17 @@ class Task:
 _TASK = TypeAdapter(Task)
 
 
-def run_on_workers(client: Any, run: RunFolder, pairs: Sequence[Pair], made: Made, progress: RunProgress) -> None:
+def run_on_workers(
+    client: Any,
+    run: RunFolder,
+    pairs: Sequence[Pair],
+    made: Made,
+    progress: RunProgress,
+    done: Callable[[Pair], None] | None = None,
+) -> None:
     """Run pairs on the workers of a Dask client; returns when all of their cells are finished.
+
+    `done` is told each finished pair.
 
     Raises:
         InputError: The workers do not see the folder, or go away.
@@ -65,7 +75,7 @@ def run_on_workers(client: Any, run: RunFolder, pairs: Sequence[Pair], made: Mad
     token = uuid.uuid4().hex
     (folder / _TOKEN).write_text(token)
     try:
-        _Dispatch(client, folder, token, pairs, made, progress).run()
+        _Dispatch(client, folder, token, pairs, made, progress, done).run()
     finally:
         # workers of a cluster outlive this process; without the token they stop after their present cell
         if _token(folder) == token:
@@ -83,8 +93,16 @@ class _Dispatch:
     """Keeps the workers busy until all pairs are done."""
 
     def __init__(
-        self, client: Any, folder: Path, token: str, pairs: Sequence[Pair], made: Made, progress: RunProgress
+        self,
+        client: Any,
+        folder: Path,
+        token: str,
+        pairs: Sequence[Pair],
+        made: Made,
+        progress: RunProgress,
+        done: Callable[[Pair], None] | None = None,
     ) -> None:
+        self._tell_done = done
         self._client = client
         self._run = RunFolder(folder)
         self._token = token
@@ -140,6 +158,8 @@ class _Dispatch:
             taken = _token(self._run.path) != self._token
             raise InputError(f"{self._run.path}: another run has taken the folder" if taken else problem)
         self._n_done += len(pair.todo)
+        if self._tell_done is not None:
+            self._tell_done(pair)
 
     def _tell(self, n_named: int) -> None:
         """Report progress by counting the files of finished cells."""
@@ -177,6 +197,8 @@ def work_on(document: str) -> str:
             death_of_cell = death or _death_of_cell(task, here, each, trace)
             if death_of_cell:
                 here.write_died(each, f"killed its worker, and again where it ran alone ({death_of_cell})")
+        if pair.keep != "sessions":
+            drop_pair(run, pair.name, pair.seed, pair.keep)
     return ""
 
 

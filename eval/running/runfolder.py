@@ -23,7 +23,7 @@ effects.csv                                   where a world was run with and wit
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,10 +40,11 @@ from cdpipe.core.names import path_part
 from eval.core.output import make_writable, remove, require_no_links, whole_file
 from eval.core.provenance import FORMAT_VERSION, TOOL
 from eval.core.statistics import summarise
-from eval.core.tablefile import read_table
+from eval.core.tablefile import read_table, write_rows
 from eval.plans.coverage import measure_coverage, read_stored_plan
 from eval.plans.targets import read_targets
 from eval.plans.worlds import world_slug
+from eval.running.cell_rows import ITEM_TABLES, SURFACE_TABLES, collect_tables, holds_rows
 from eval.tables.effects import effects
 from eval.tables.hardness import FILES as HARD_FILES
 from eval.tables.hardness import breaking_points, hardness_table
@@ -55,20 +56,7 @@ from eval.tables.region_table import region_tables
 from eval.tables.surface_table import FILES as SURFACE_FILES
 from eval.tables.surface_table import surface_tables
 
-IDENTITY = ("scenario", "seed", "variant")
-# columns of text of results.csv and the item tables; every other one holds numbers or truth values
-TEXT_COLUMNS = {
-    "scenario", "variant", "preset", "family", "pair_kind", "domain", "commit", "status", "error", "session", "name",
-    "kind", "prop_kind", "group", "why_not", "matched_kind", "outcome", "found_changes",
-    "found_changes_proposed", "checkpoints", "extras", "odometry_before", "odometry_after", "sensor_profile",
-}  # fmt: skip
-_NAMED = {"scenario": str, "seed": int, "variant": str}
-ITEM_TABLES = ("changes", "regions", "objects", "keyframes")
-# tables of rock that moved: a cell has their rows, and a run their files, only where there are some
-SURFACE_TABLES = ("surface_changes", "surface_windows")
 _MAPS = {"before_points": ArraySpec("N,3", "float32"), "after_points": ArraySpec("M,3", "float32")}
-# what readers of an empty table may ask for
-_MINIMAL_COLUMNS = {"keyframes": ("keyframe", "score", "label")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,8 +96,12 @@ class RunFolder:
 
     def finished_cells(self) -> list[dict[str, Any]]:
         """Return every finished cell, by its path."""
-        cells = (self.read_cell(path) for path in sorted(self.path.glob("cells/*/*/*.json")))
-        return [cell for cell in cells if cell is not None]
+        return list(self.each_cell())
+
+    def each_cell(self) -> Iterator[dict[str, Any]]:
+        """Yield every finished cell, by its path; no more than one is held."""
+        cells = map(self.read_cell, sorted(self.path.glob("cells/*/*/*.json")))
+        return (cell for cell in cells if cell is not None)
 
     def read_cell(self, path: Path) -> dict[str, Any] | None:
         """Read a finished cell; None where there is none, or what is there was cut short.
@@ -118,7 +110,7 @@ class RunFolder:
             InputError: It is of a newer tunnelcd.
         """
         document = read_json(path)
-        if not {"key", "order", "row", *ITEM_TABLES} <= set(document) or not _holds_rows(document):
+        if not {"key", "order", "row", *ITEM_TABLES} <= set(document) or not holds_rows(document):
             return None
         _require_format(path, document)
         return document
@@ -199,27 +191,22 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     Raises:
         InputError: No cell is finished.
     """
-    whole = run.finished_cells()
-    if not whole:
-        raise InputError(f"{run.path}: no finished cell: run a plan first")
-    whole.sort(key=lambda cell: (cell["order"][0], cell["row"]["scenario"], cell["row"]["seed"], cell["order"][1]))
-    # older cells lack the column; they were run without workers
-    results = pd.DataFrame([{**cell["row"], "is_contended": cell["row"].get("is_contended", False)} for cell in whole])
-    _write_csv(run.path / "results.csv", results)
-    items = {table: _items(table, whole) for table in ITEM_TABLES}
+    collected = collect_tables(run)
+    results, items = collected["results"], {table: collected[table] for table in ITEM_TABLES}
+    write_rows(run.path / "results.csv", results)
     for table, frame in items.items():
-        _write_csv(run.path / f"{table}.csv", frame)
+        write_rows(run.path / f"{table}.csv", frame)
     _write_csv(run.path / "summary.csv", summarise(results, keyframes=items["keyframes"]))
-    surface_items = {table: _items(table, whole) for table in SURFACE_TABLES}
+    surface_items = {table: collected[table] for table in SURFACE_TABLES}
     tables = {
         **surface_items,
         "effects": effects(results),
         "merge": merge_table(results, read_targets(run.stored_provenance())),
         **_report_tables(run, results, {**items, **surface_items}),
     }
-    for name, found in tables.items():
-        if len(found):
-            _write_csv(run.path / f"{name}.csv", found)
+    for name, frame in tables.items():
+        if len(frame):
+            _write_csv(run.path / f"{name}.csv", frame)
         else:
             remove(run.path / f"{name}.csv")
     return results
@@ -247,7 +234,7 @@ def current_results(run: RunFolder, earlier: Mapping[str, Any], now: Mapping[str
         return None
     if max(cell.stat().st_mtime_ns for cell in cells) >= min(table.stat().st_mtime_ns for table in tables):
         return None
-    results = read_table(run.path / "results.csv", low_memory=False)
+    results = read_table(run.path / "results.csv")
     return results if len(results) == len(cells) else None
 
 
@@ -317,11 +304,6 @@ def json_text(document: Mapping[str, Any]) -> str:
     return json.dumps(document, indent=1, default=_plain)
 
 
-def _items(table: str, cells: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    rows = [item for cell in cells for item in cell.get(table, ())]
-    return pd.DataFrame(rows) if rows else pd.DataFrame(columns=[*IDENTITY, *_MINIMAL_COLUMNS.get(table, ())])
-
-
 def _write_csv(path: Path, frame: pd.DataFrame) -> None:
     with whole_file(path) as partial:
         frame.to_csv(partial, index=False)
@@ -331,21 +313,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"{type(value).__name__} does not fit into JSON")
-
-
-def _holds_rows(document: Mapping[str, Any]) -> bool:
-    """Return whether a cell holds rows of numbers, and of texts where texts belong, and names its case in each."""
-    tables = [[document["row"]], *(document[table] for table in ITEM_TABLES)]
-    tables += [document[table] for table in SURFACE_TABLES if table in document]
-    if not all(isinstance(rows, list) and all(isinstance(row, dict) for row in rows) for rows in tables):
-        return False
-    is_plain = all(
-        not isinstance(value, list | dict) and (not isinstance(value, str) or name in TEXT_COLUMNS)
-        for rows in tables
-        for row in rows
-        for name, value in row.items()
-    )
-    names = [(type(row.get(name)), kind) for rows in tables for row in rows for name, kind in _NAMED.items()]
-    order = document["order"]
-    is_placed = isinstance(order, list) and [type(place) for place in order] == [int, int]
-    return is_plain and is_placed and all(found is kind for found, kind in names)

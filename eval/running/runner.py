@@ -8,14 +8,14 @@ other error of the input become rows; a bug is not caught.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from itertools import groupby
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.errors import InputError
 from cdpipe.descriptors import list_checkpoints
 from cdpipe.methods.registry import load_source
 from cdpipe.surface.measure import require_method
@@ -25,13 +25,16 @@ from eval.core.progress import RunProgress, Silent
 from eval.core.provenance import describe_run, digest
 from eval.plans.plan import Plan, expand_cells
 from eval.plans.variants import Cell
-from eval.plans.worlds import world_slug
-from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Todo, Tools, cell_key, is_finished, pair_lock
+from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Tools, pair_lock
 from eval.running.run_workers import remove_traces, run_on_workers
 from eval.running.runfolder import RunFolder, current_results, write_json, write_tables
+from eval.running.scaling.keeping import Keep, drop_pair, dropped_file, is_dropped, remove_leftovers
+from eval.running.scaling.mirror import Mirror
+from eval.running.scaling.remaking import remake_pair
+from eval.running.scaling.shards import Shard, choose_cells, require_same_shard
+from eval.running.schedule import limit_pairs, schedule_pairs
 from eval.running.stages import PairStages
 from eval.truth.ground_truth import GroundTruth
-from scenarios.references import file_digests
 from sim.session.truth import read_pair_truth
 
 
@@ -53,6 +56,9 @@ def run_plan(
     force: bool = False,
     limit: int | None = None,
     where: Where = HERE,
+    shard: Shard | None = None,
+    keep: Keep | None = None,
+    mirror: Mirror | None = None,
     progress: RunProgress | None = None,
     tools: Tools | None = None,
 ) -> RunOutcome:
@@ -65,21 +71,31 @@ def run_plan(
         force: Run all cells again and simulate all pairs again.
         limit: Run at most this many cells.
         where: In this process, on workers of this machine, or on a cluster.
+        shard: Run the pairs of this shard alone.
+        keep: What stays of a pair after its last cell; None leaves its sessions, and makes none again.
+        mirror: Where rows and answers are copied to, and finished ones taken from.
         progress: Receives the progress.
         tools: What draws and simulates worlds, and names the code and the time; workers simulate with their own.
 
     Raises:
         InputError: A setting is wrong, a method's extra is missing, the folder cannot be written or holds another
-            world or variant where one of the plan belongs, or cells of another split, or the cluster cannot be used.
+            world or variant where one of the plan belongs, cells of another split or shard, or the cluster or the
+            mirror cannot be used.
     """
     progress, tools = progress or Silent(), tools or TOOLS
     require_usable(where)
-    _require_one_split(run, plan)
+    for place, earlier in _earlier_runs(run, mirror):
+        _require_one_split(place, earlier, plan)
+        require_same_shard(place, earlier, shard)
     all_cells = expand_cells(plan)
-    provenance = _provenance(plan, all_cells, command, tools)
-    pairs = _pairs(run, plan, all_cells, force, tools)
+    own_cells = choose_cells(all_cells, shard)
+    told = {} if shard is None else {"shard": str(shard)}
+    provenance = {**_provenance(plan, all_cells, command, tools), **told}
+    if mirror is not None:
+        mirror.fetch(run, progress)
+    pairs = schedule_pairs(run, plan, all_cells, force, tools, shard=shard, keep=keep, is_lean=True, progress=progress)
     n_todo = sum(len(pair.todo) for pair in pairs)
-    chosen = _limited(pairs, limit)
+    chosen = limit_pairs(pairs, limit)
     n_run = sum(len(pair.todo) for pair in chosen)
     _require_extras(chosen)
     _tell_idle(where, len(chosen), progress)
@@ -91,21 +107,30 @@ def run_plan(
             write_json(run.path / "provenance.json", provenance)
         remove_traces(run)
         # cells left by --limit may be outdated as well, and no table may hold outdated cells
+        remove_leftovers(run)
         for pair in pairs:
             _remove_stale(run, pair, force)
+        if mirror is not None:
+            mirror.forget(run, pairs)
+        done = None if mirror is None else partial(mirror.copy_pair, run)
         if client is None:
-            _run_here(run, chosen, made, progress, tools)
+            _run_here(run, chosen, made, progress, tools, done)
         else:
-            run_on_workers(client, run, chosen, made, progress)
+            run_on_workers(client, run, chosen, made, progress, done)
+    _settle(run, pairs, keep, progress, tools)
     progress.cells("done", n_run, n_run)
     if results is None:
         results = write_tables(run)
         write_json(run.path / "provenance.json", {**provenance, "finished": tools.now()})
+    if mirror is not None:
+        mirror.copy_tables(run)
     n_died = int((results["status"] == "worker_died").sum())
-    return RunOutcome(n_run, len(all_cells) - n_todo, n_todo - n_run, n_died)
+    return RunOutcome(n_run, len(own_cells) - n_todo, n_todo - n_run, n_died)
 
 
-def list_cells(plan: Plan, path: Path, *, force: bool = False, limit: int | None = None) -> list[tuple[Cell, str]]:
+def list_cells(
+    plan: Plan, path: Path, *, force: bool = False, limit: int | None = None, shard: Shard | None = None
+) -> list[tuple[Cell, str]]:
     """Return each cell of a plan and its state, "finished", "to do", or "left" by `limit`; writes nothing.
 
     Raises:
@@ -113,14 +138,15 @@ def list_cells(plan: Plan, path: Path, *, force: bool = False, limit: int | None
     """
     run = RunFolder(path)
     if path.is_dir() and any(path.iterdir()):
-        run.provenance()
-        _require_one_split(run, plan)
+        _require_one_split(str(path), run.provenance(), plan)
+        require_same_shard(str(path), run.provenance(), shard)
     elif path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file: name a folder to run in")
     all_cells = expand_cells(plan)
-    pairs = _pairs(run, plan, all_cells, force, TOOLS)
-    todo, chosen = ({each.cell for pair in some for each in pair.todo} for some in (pairs, _limited(pairs, limit)))
-    return [(cell, "to do" if cell in chosen else "left" if cell in todo else "finished") for cell in all_cells]
+    pairs = schedule_pairs(run, plan, all_cells, force, TOOLS, shard=shard, is_lean=True)
+    own_cells = choose_cells(all_cells, shard)
+    todo, chosen = ({each.cell for pair in some for each in pair.todo} for some in (pairs, limit_pairs(pairs, limit)))
+    return [(cell, "to do" if cell in chosen else "left" if cell in todo else "finished") for cell in own_cells]
 
 
 def list_plan_pairs(plan: Plan, run: RunFolder, tools: Tools = TOOLS) -> list[Pair]:
@@ -129,8 +155,8 @@ def list_plan_pairs(plan: Plan, run: RunFolder, tools: Tools = TOOLS) -> list[Pa
     Raises:
         InputError: A setting of the plan is wrong, or the folder holds another world or cells of another split.
     """
-    _require_one_split(run, plan)
-    return [replace(pair, todo=()) for pair in _pairs(run, plan, expand_cells(plan), False, tools)]
+    _require_one_split(str(run.path), run.stored_provenance(), plan)
+    return [replace(pair, todo=()) for pair in schedule_pairs(run, plan, expand_cells(plan), False, tools)]
 
 
 def open_pair(
@@ -151,7 +177,14 @@ def start_provenance(plan: Plan, run: RunFolder, command: Sequence[str], tools: 
         write_json(run.path / "provenance.json", {**told, "finished": tools.now()})
 
 
-def _run_here(run: RunFolder, pairs: Sequence[Pair], made: Made, progress: RunProgress, tools: Tools) -> None:
+def _run_here(
+    run: RunFolder,
+    pairs: Sequence[Pair],
+    made: Made,
+    progress: RunProgress,
+    tools: Tools,
+    done: Callable[[Pair], None] | None = None,
+) -> None:
     n_done, n_run = 0, sum(len(pair.todo) for pair in pairs)
     for pair in pairs:
         with pair_lock(run, pair):
@@ -162,57 +195,25 @@ def _run_here(run: RunFolder, pairs: Sequence[Pair], made: Made, progress: RunPr
                 progress.cells(f"{pair.name} {pair.seed} {each.cell.variant}", n_done, n_run)
                 here.do(each)
                 n_done += 1
+            if pair.keep != "sessions":
+                drop_pair(run, pair.name, pair.seed, pair.keep)
+        if done is not None:
+            done(pair)
 
 
-def _pairs(run: RunFolder, plan: Plan, all_cells: Sequence[Cell], force: bool, tools: Tools) -> list[Pair]:
-    variants = list(dict.fromkeys(cell.variant for cell in all_cells))
-    places = {world.label: (place, world) for place, world in enumerate(plan.worlds)}
-    for label in places:
-        if (row := run.any_row(world_slug(label))) is not None and row["scenario"] != label:
-            raise InputError(
-                f"{run.path}: holds the world {row['scenario']}, and {label} has the same folder: rename one, or name "
-                "another run folder"
-            )
-    pairs = []
-    for (label, seed), group in groupby(all_cells, key=lambda cell: (cell.scenario, cell.seed)):
-        place, world = places[label]
-        scenario, files, error = None, {}, ""
-        try:
-            scenario = tools.draw(world.name, seed, world.settings)
-            files = file_digests(scenario)
-        except ScenarioError as mistake:
-            error = str(mistake)
-        every = [
-            Todo(cell, cell_key(cell, world.pair_kind, scenario, files), (place, variants.index(cell.variant)))
-            for cell in group
-        ]
-        todo = [each for each in every if not is_finished(run, each) or force]
-        # cells with the same map settings run one after the other: only one pair of maps is held
-        todo.sort(key=lambda each: each.cell.config.map.model_dump_json())
-        family = world.name if scenario is None else scenario.family
-        pairs.append(Pair(label, family, world.pair_kind, seed, scenario, files, error, tuple(todo)))
-    return pairs
+def _earlier_runs(run: RunFolder, mirror: Mirror | None) -> list[tuple[str, Mapping[str, Any]]]:
+    """Return the place and the provenance of what was run before, here and where rows are copied to."""
+    here = str(run.path), run.stored_provenance()
+    return [here] if mirror is None else [here, (mirror.url, mirror.provenance())]
 
 
-def _limited(pairs: Sequence[Pair], limit: int | None) -> list[Pair]:
-    """Return the pairs that have cells to run, with at most `limit` cells in total."""
-    left = sum(len(pair.todo) for pair in pairs) if limit is None else limit
-    chosen = []
-    for pair in pairs:
-        todo = pair.todo[:left]
-        left -= len(todo)
-        if todo:
-            chosen.append(replace(pair, todo=todo))
-    return chosen
-
-
-def _require_one_split(run: RunFolder, plan: Plan) -> None:
+def _require_one_split(place: str, provenance: Mapping[str, Any], plan: Plan) -> None:
     """Refuse a folder with cells of another split: its tables would mix seeds that were looked at with sealed ones."""
-    earlier = run.stored_provenance().get("plan")
+    earlier = provenance.get("plan")
     if isinstance(earlier, Mapping) and earlier.get("split", "") != plan.split:
         told = [split or "as plans name them" for split in (str(earlier.get("split", "")), plan.split)]
         way = "give --split sealed, or name another folder" if not plan.split else "name another folder"
-        raise InputError(f"{run.path}: its seeds are {told[0]}, these are {told[1]}: {way}")
+        raise InputError(f"{place}: its seeds are {told[0]}, these are {told[1]}: {way}")
 
 
 def _require_extras(pairs: Sequence[Pair]) -> None:
@@ -247,12 +248,31 @@ def _remove_stale(run: RunFolder, pair: Pair, force: bool) -> None:
     """Remove what is about to run again, so that no table holds it if the run is interrupted."""
     if not pair.todo:
         return
-    if force or not _is_simulated(run.pair(pair.name, pair.seed), pair):
+    if force or not (_is_simulated(run.pair(pair.name, pair.seed), pair) or _is_dropped(run, pair)):
         remove(run.pair(pair.name, pair.seed))
         remove(run.maps(pair.name, pair.seed))
+        remove(dropped_file(run, pair.name, pair.seed))
     for each in pair.todo:
         remove(run.cell(pair.name, pair.seed, each.cell.variant))
         remove(run.answer(pair.name, pair.seed, each.cell.variant))
+
+
+def _is_dropped(run: RunFolder, pair: Pair) -> bool:
+    drawn = None if pair.scenario is None else pair.scenario.model_dump(mode="json")
+    return drawn is not None and is_dropped(run, pair.name, pair.seed, drawn, pair.files)
+
+
+def _settle(run: RunFolder, pairs: Sequence[Pair], keep: Keep | None, progress: RunProgress, tools: Tools) -> None:
+    """Give the pairs that were finished before what `--keep` says: remove their sessions, or make them again."""
+    for pair in pairs:
+        if pair.todo or keep is None:
+            continue
+        if keep == "sessions":
+            if dropped_file(run, pair.name, pair.seed).is_file():
+                remake_pair(run, pair.name, pair.seed, progress, tools)
+        elif keep == "nothing" or run.pair(pair.name, pair.seed).is_dir():
+            with pair_lock(run, pair):
+                drop_pair(run, pair.name, pair.seed, keep)
 
 
 def _is_simulated(path: Path, pair: Pair) -> bool:

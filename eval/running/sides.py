@@ -212,7 +212,8 @@ def list_versions(rows: Iterable[Row]) -> set[str]:
 
 
 def _mending(path: Path) -> str:
-    if any((path / "answers").glob("*/*/*/answer.json")) and (path / "pairs").is_dir():
+    has_truth = (path / "pairs").is_dir() or (path / "dropped").is_dir()
+    if any((path / "answers").glob("*/*/*/answer.json")) and has_truth:
         return f"`tunnelcd score {path}` scores it again"
     return f"{path} holds no answers and truths to score again: run its plan again"
 

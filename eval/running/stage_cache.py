@@ -98,10 +98,11 @@ def open_cache(folder: Path, sessions: tuple[Path, Path]) -> StageCache:
 def session_digest(session: Path) -> str:
     """Return the digest of the files of a session that the pipeline may read: all but its truth."""
     files = (path for path in session.rglob("*") if path.is_file())
-    return _files_digest(session, [path for path in files if path.relative_to(session).parts[0] != "truth"])
+    return files_digest(session, [path for path in files if path.relative_to(session).parts[0] != "truth"])
 
 
-def _files_digest(folder: Path, paths: Iterable[Path]) -> str:
+def files_digest(folder: Path, paths: Iterable[Path]) -> str:
+    """Return the digest of the names and contents of files below a folder."""
     found = {}
     for path in paths:
         with path.open("rb") as file:
@@ -110,7 +111,7 @@ def _files_digest(folder: Path, paths: Iterable[Path]) -> str:
 
 
 # Read when the process starts: later the files may be newer than the loaded code.
-CODE = _files_digest(Path(cdpipe.__path__[0]), Path(cdpipe.__path__[0]).rglob("*.py"))
+CODE = files_digest(Path(cdpipe.__path__[0]), Path(cdpipe.__path__[0]).rglob("*.py"))
 
 
 def _write(path: Path, kept: Kept) -> None:
@@ -156,10 +157,15 @@ def _is_maps(name: str) -> bool:
 
 
 def _maps_bytes(folder: Path) -> int:
-    """Return how many bytes the maps of all pairs beside one take; another process may remove some meanwhile."""
+    """Return how many bytes the maps of all pairs beside one take, counted up to `MAPS_BYTES`.
+
+    Another process may remove some meanwhile.
+    """
     total = 0
     for place, _, names in os.walk(folder.parents[2]):
         for name in filter(_is_maps, names):
             with suppress(FileNotFoundError):
                 total += Path(place, name).stat().st_size
+        if total >= MAPS_BYTES:
+            break  # else every pair of thousands would look at the folders of all
     return total

@@ -28,6 +28,7 @@ from cdpipe.model.config import MapConfig, load_config
 from cdpipe.model.types import DescriptorSet, MappedSession, PointMap, PosedScan, ScanSource, WrappedScans
 from cdpipe.training.shard import CHANGE_KINDS, FORMAT_VERSION, encode_shard, split_of
 from eval.core.provenance import digest
+from eval.graft import make_afters
 from eval.oracles.merge import OracleMerge, merged_by_truth
 from eval.scoring.merge_metrics import PAIR_RADIUS_M
 from eval.scoring.region_metrics import label_keyframes, transform_to_map
@@ -39,7 +40,6 @@ from scenarios.references import file_digests
 from scenarios.schema import Scenario, SessionPlan
 from sim.session.simulate import LabelledSession
 from sim.session.truth import PairTruth
-from sim.story.afters import simulate_afters
 
 _MAX_CHANGES = 255  # labels are bytes
 # Mapped at a time: their sums stay in the cache, which takes a quarter off the mapping of 64 at a time.
@@ -117,7 +117,7 @@ def make_shards(family: str, seed: int, recipe: Recipe) -> list[bytes]:
     plans = [_draw_after(family, scenario, seed, recipe, number) for number in range(2, recipe.afters + 1)]
     shards: list[bytes] = []
     before: _Mapped | None = None
-    for pair in simulate_afters(scenario, plans, seed):
+    for pair in make_afters(scenario, plans, seed):
         if len(pair.truth.changes) > _MAX_CHANGES:
             raise ScenarioError(f"{family}: {len(pair.truth.changes)} changes, labels can tell {_MAX_CHANGES} apart")
         before = before or _map_held(pair.sessions["before"])

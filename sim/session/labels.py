@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
-from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 from cdpipe.core.voxel import cell_keys
 from scenarios.schema import Scenario
 from sim.geometry.mesh import Mesh, NearSurface, crop_near, drop_unused_vertices, join_meshes, split_triangles
 from sim.geometry.raycast import Caster
 from sim.placement.contact import standing_surface
 from sim.placement.placing import Standing
-from sim.scene import Scene, World
 from sim.sensor.rays import Rays
 from sim.session.truth import SESSIONS, Change, Group, Kind, SessionName
 
@@ -27,6 +28,34 @@ UNMOVED_M = 1e-3
 _SAME_SURFACE_M = 0.02  # parts of a reshaped prop's surface nearer than this to its other surface have not changed
 _SAMPLE_M = 0.03
 _SLACK_M = 0.01  # added to the radius of the ball around a ghost, so that rounding loses no ray
+
+
+class Surfaces(Protocol):
+    """The surfaces of a session that changes are compared on, such as `sim.scene.Scene`: meshes and their instance."""
+
+    @property
+    def meshes(self) -> tuple[Mesh, ...]:
+        """Surface of every geom, world frame."""
+
+    @property
+    def instance(self) -> Int32Array:
+        """(G,) number of the prop that each geom belongs to, 0 for all else."""
+
+
+class Compared(Protocol):
+    """The props of a pair and the surfaces of its two sessions, such as `sim.scene.World`."""
+
+    @property
+    def standing(self) -> Sequence[Standing]:
+        """Every prop at each of its places."""
+
+    @property
+    def before(self) -> Surfaces:
+        """What the before session shows."""
+
+    @property
+    def after(self) -> Surfaces:
+        """What the after session shows."""
 
 
 class Ghost:
@@ -128,7 +157,7 @@ class Tally:
         )
 
 
-def list_changes(scenario: Scenario, world: World) -> list[Tally]:
+def list_changes(scenario: Scenario, world: Compared) -> list[Tally]:
     """Compare the props of both scenes and return every change of the pair, in the order of the props.
 
     A prop that stands in one session only was added or removed. A prop of the same shape was moved if any of its
@@ -174,7 +203,7 @@ def _is_same(start: Standing, end: Standing) -> bool:
     return a.shape == b.shape and bool((np.linalg.norm(a - b, axis=1) <= UNMOVED_M).all())
 
 
-def _tally(change_id: int, instance: int, item: Standing, world: World, group: Group, partner: int | None) -> Tally:
+def _tally(change_id: int, instance: int, item: Standing, world: Compared, group: Group, partner: int | None) -> Tally:
     session: SessionName = "before" if "before" in item.sessions else "after"
     scene, other = (world.before, world.after) if session == "before" else (world.after, world.before)
     surface = _surface_in(scene, instance)
@@ -200,7 +229,7 @@ def _tally(change_id: int, instance: int, item: Standing, world: World, group: G
     return Tally(change, Ghost(surface), _near(other, surface) if group == "partial" else None)
 
 
-def _tally_reshaped(change_id: int, instance: int, start: Standing, end: Standing, world: World) -> Tally:
+def _tally_reshaped(change_id: int, instance: int, start: Standing, end: Standing, world: Compared) -> Tally:
     """Return the change of a pile that was partly loaded away.
 
     Its ghost is the missing part of the old surface. This surface is open, which is enough: a ray that would have met
@@ -264,11 +293,11 @@ def _tree(points: Float64Array) -> cKDTree:
     return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
-def _surface_in(scene: Scene, instance: int) -> Mesh:
+def _surface_in(scene: Surfaces, instance: int) -> Mesh:
     return join_meshes([mesh for mesh, owner in zip(scene.meshes, scene.instance, strict=True) if owner == instance])
 
 
-def _near(scene: Scene, surface: Mesh) -> NearSurface:
+def _near(scene: Surfaces, surface: Mesh) -> NearSurface:
     """Return the surfaces of a scene that lie near a surface."""
     parts = (crop_near(mesh, surface, 2 * NEAR_OLD_SURFACE_M) for mesh in scene.meshes)
     return NearSurface(join_meshes([_compact(part) for part in parts if len(part.faces)]), NEAR_OLD_SURFACE_M)

@@ -200,6 +200,7 @@ class PairTruth:
         movers: What moved in either session, before first; the file has the key only where there are some.
         surface_changes: Rock that moved, came or went; the file has the key only where there are some.
         story: The story (`sim.story`) of which the pair is two sessions; the file has the key only there.
+        graft: What was cast into which recording (`sim.graft`); the file has the key only there.
     """
 
     __pydantic_config__ = _CHECKS
@@ -212,13 +213,14 @@ class PairTruth:
     movers: tuple[MoverTruth, ...] = ()
     surface_changes: tuple[SurfaceChangeTruth, ...] = ()
     story: dict[str, Any] | None = None
+    graft: dict[str, Any] | None = None
 
 
 def write_pair_truth(pair: Path, truth: PairTruth) -> None:
     """Write `PAIR/truth/changes.json`."""
     (pair / "truth").mkdir(parents=True, exist_ok=True)
     document = asdict(truth)
-    for key in ("movers", "surface_changes", "story"):
+    for key in ("movers", "surface_changes", "story", "graft"):
         if not document[key]:
             del document[key]  # the truth of an older scenario keeps its bytes
     (pair / "truth" / "changes.json").write_text(json.dumps(document, indent=1))

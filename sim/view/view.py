@@ -19,6 +19,7 @@ from cdpipe.io.session import is_session, read_session
 from scenarios.schema import Scenario
 from sim.drive.trajectory import Trajectory
 from sim.geometry.mesh import Mesh, cylinder_mesh, drop_unused_vertices, join_meshes, move_mesh
+from sim.graft.rebuild import rebuild_props
 from sim.placement.placing import Standing, standing_box
 from sim.placement.puddles import Pool
 from sim.props.shapes import solid_mesh
@@ -137,19 +138,23 @@ def view_pair(pair: Path) -> View:
         InputError: The pair or its truth is missing, damaged, or of a version whose scenario cannot be built here.
     """
     truth = read_pair_truth(pair)
-    built = build_pair(pair, truth)
-    world, drives, movers = built.world, built.drives, built.movers
     poses = {session: read_true_poses(pair / session) for session in SESSIONS}
     lines = [Line(f"paths/{session}", poses[session][:, :3, 3], SESSION_RGB[session]) for session in SESSIONS]
     kinds = {change.id: change.kind for change in truth.changes}
     clouds = tuple(
         session_cloud(f"returns/{session}", read_session(pair / session), poses[session], kinds) for session in SESSIONS
     )
-    view = _world_view(f"{pair}: {truth.family}, seed {truth.seed}", world, lines, clouds, movers, built.pools, ())
+    title = f"{pair}: {truth.family}, seed {truth.seed}"
     revolutions = [
         Revolutions(f"revolution/{session}", read_session(pair / session), poses[session], kinds)
         for session in SESSIONS
     ]
+    if truth.graft is not None:
+        view = _props_view(title, rebuild_props(truth), lines, clouds)
+        return replace(view, play=_player(poses.items(), (), {}, revolutions))
+    built = build_pair(pair, truth)
+    world, drives, movers = built.world, built.drives, built.movers
+    view = _world_view(title, world, lines, clouds, movers, built.pools, ())
     return replace(view, play=_player(poses.items(), movers, drives, revolutions))
 
 
@@ -298,6 +303,14 @@ def _world_view(
             target = rock[-1].mesh.vertices.mean(axis=0)
             eye = target + np.array([-6.0, -6.0, 8.0])
     return View(title, wall_bands(wall, floor_points), surfaces, all_lines, clouds, labels, eye, target, notes)
+
+
+def _props_view(title: str, standing: Sequence[Standing], lines: Sequence[Line], clouds: tuple[Cloud, ...]) -> View:
+    """Return the view of a grafted pair, whose walls are known by their returns alone."""
+    surfaces = tuple(surface for item in standing for surface in _prop_surfaces(item))
+    target = lines[0].points[len(lines[0].points) // 2]
+    labels = tuple(_label(item) for item in standing)
+    return View(title, (), surfaces, tuple(lines), clouds, labels, target + np.array([-6.0, -6.0, 8.0]), target)
 
 
 def _rock_surfaces(world: World) -> list[Surface]:

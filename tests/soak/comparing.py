@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from eval.running.runfolder import IDENTITY
+from eval.running.cell_rows import IDENTITY
 from tests.same_numbers import TABLES, differences, is_time
 from tests.trust.contents import contents
 

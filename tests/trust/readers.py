@@ -46,8 +46,9 @@ from eval.plans.plan import expand_cells, load_plan
 from eval.release.archive import pack, unpack_release, write_sums
 from eval.report.comparison import compare_sides
 from eval.report.page import write_page
+from eval.running.cell_file import LAST, NO_KEY, cell_document
 from eval.running.export import name_blindly
-from eval.running.rescoring import LAST, NO_KEY, cell_document, foreign_identity
+from eval.running.rescoring import foreign_identity
 from eval.running.run_data import read_run
 from eval.running.runfolder import RunFolder, open_run_folder, write_json, write_tables
 from eval.running.sides import read_side

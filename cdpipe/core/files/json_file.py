@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,6 +19,9 @@ MAX_DEPTH = 64
 MAX_VALUES = 1_000_000
 """A mistake about each of so many takes 400 MB; the cell of a tunnel of 10 km holds less than a fifth."""
 _MAX_INTEGER = 2**64
+_OUTER = (dict, list)
+_LONG_NUMBER = re.compile(rb"\d{20}")  # a number beyond 64 bits has as many digits
+_EXPONENT = re.compile(rb"\d[eE]\+?\d{3}")  # what may be read as infinite
 
 
 def parse_json(text: str | bytes, *, is_finite: bool = False) -> Any:
@@ -39,12 +43,15 @@ def parse_json(text: str | bytes, *, is_finite: bool = False) -> Any:
     except RecursionError as error:
         raise ValueError(f"nested deeper than {MAX_DEPTH} levels") from error
     level: list[Any] = [document]
-    n_values = 0
+    n_values, is_plain = 0, _is_plain(text, is_finite=is_finite)
     for _ in range(MAX_DEPTH):
         n_values += sum(len(outer) for outer in level if isinstance(outer, dict | list))
         if n_values > MAX_VALUES:
             raise ValueError(f"more than {MAX_VALUES} values")
-        level = [inner for outer in level for inner in _check_values(outer, is_finite)]
+        if is_plain:
+            level = [inner for outer in level for inner in _values(outer) if type(inner) in _OUTER]
+        else:
+            level = [inner for outer in level for inner in _check_values(outer, is_finite)]
         if not level:
             return document
     raise ValueError(f"nested deeper than {MAX_DEPTH} levels")
@@ -73,6 +80,17 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         ((twice, _),) = Counter(name for name, _ in pairs).most_common(1)
         raise ValueError(f"the key {twice[:40]!r} stands there twice")
     return found
+
+
+def _is_plain(text: str | bytes, *, is_finite: bool) -> bool:
+    """Tell whether the text alone shows that no value of it is to be refused; most files are so."""
+    content = text.encode(errors="surrogatepass") if isinstance(text, str) else text
+    is_odd = not content.isascii() or b"\\u" in content or _LONG_NUMBER.search(content) is not None
+    return not is_odd and not (is_finite and (b"N" in content or b"I" in content or _EXPONENT.search(content)))
+
+
+def _values(outer: Any) -> Iterable[Any]:
+    return outer.values() if type(outer) is dict else outer if type(outer) is list else ()
 
 
 def _check_values(outer: Any, is_finite: bool) -> list[Any]:

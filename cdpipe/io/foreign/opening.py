@@ -21,9 +21,11 @@ from cdpipe.core.motion import Motion
 from cdpipe.core.plugins import require_extra
 from cdpipe.io.foreign.clouds import Clouds, point_times
 from cdpipe.io.foreign.folders import E57Scans, open_folder
+from cdpipe.io.foreign.points_files import cloud_reader
 from cdpipe.io.foreign.scans import PosedClouds
 from cdpipe.io.foreign.sniff import FORMATS, guess_format, require_format_name
 from cdpipe.io.foreign.trajectory import Trajectory, poses_at, read_poses, require_times_of_scans
+from cdpipe.io.foreign.whole_map import MapStations
 from cdpipe.io.ply import write_ply_points
 from cdpipe.io.tum import write_tum
 from cdpipe.mapping.odometry import estimate_cloud_motion
@@ -93,6 +95,9 @@ def open_recording(path: Path, how: HowToRead, report: Progress) -> PosedClouds:
         InputError: It cannot be read, has no poses, or they do not fit its scans.
     """
     source = _pose(_open_clouds(path, how), how, report)
+    source.is_whole_map = isinstance(source.clouds, MapStations)
+    if source.is_whole_map:
+        return source
     if not source.clouds.is_stream:
         if how.odometry is None and len(source.odom_T_sensor) > 1:
             check_quaternion_order(source, source.poses_from)
@@ -115,6 +120,8 @@ def convert_recording(path: Path, out: Path, how: HowToRead, report: Progress) -
         InputError: As `open_recording`, or the folder cannot be written.
     """
     source = _pose(_open_clouds(path, how), how, report)
+    if isinstance(source.clouds, MapStations):
+        raise InputError(f"{path}: a map without its scans is no session: `detect` takes it as it is")
     if not source.clouds.is_stream and how.odometry is None:
         check_quaternion_order(source, source.poses_from)
     write_scans(source, out, report)
@@ -167,10 +174,12 @@ def _open_clouds(path: Path, how: HowToRead) -> Clouds:
         raise InputError(f"{path}: --format {name}: not here: expected a file that is {FORMATS[name].about}")
     if path.is_dir():
         return open_folder(path, name, has_poses=how.trajectory is not None or how.odometry is not None)
-    raise InputError(
-        f"{path}: one cloud, a map without its scans: where nothing was scanned cannot be told from what is gone. Name "
-        "a folder with one file per scan and a trajectory, or the bag, OSF or PCAP it was made from"
-    )
+    if how.trajectory is not None or how.odometry is not None:
+        raise InputError(
+            f"{path}: one cloud, a map without its scans, has no poses: leave --trajectory and --odometry out, or name "
+            "a folder with one file per scan"
+        )
+    return MapStations(path, cloud_reader(name, path)(path))
 
 
 def _pose(clouds: Clouds, how: HowToRead, report: Progress) -> _Posed:

@@ -33,10 +33,12 @@ class PosedClouds:
         stamps_s: (S,) time of each scan, seconds.
         descriptors_in: Folder that stores its descriptors.
         is_temporary: Whether its files go with this object.
+        is_whole_map: Whether stations stand for scans that are not known.
     """
 
     descriptors_in: Path | None = None
     is_temporary = False
+    is_whole_map = False
 
     def __init__(
         self, clouds: Clouds, odom_T_sensor: Float64Array, stamps_s: Float64Array, motion: Motion | None

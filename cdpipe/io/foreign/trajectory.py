@@ -49,11 +49,13 @@ class Trajectory:
         where: The file, or what else gave the poses, for messages.
         poses: (N, 4, 4) `odom_T_sensor`.
         time_s: (N,) times, seconds of the clock of the scans; None where the file has none.
+        is_tum: Whether the file is a TUM file.
     """
 
     where: str
     poses: Float64Array
     time_s: Float64Array | None = None
+    is_tum: bool = False
 
     def motion(self) -> Motion | None:
         """Return the motion through the poses; None with one pose only, or without times that rise."""
@@ -83,7 +85,7 @@ def read_poses(path: Path) -> Trajectory:
     columns = len(words)
     if columns == 8 and "," not in lines[0][1] and ";" not in lines[0][1]:
         rows, _ = read_tum(path)
-        return Trajectory(str(path), _from_quaternions(rows[:, 1:]), rows[:, 0])
+        return Trajectory(str(path), _from_quaternions(rows[:, 1:]), rows[:, 0], is_tum=True)
     if columns not in (7, 8, 12, 13):
         raise InputError(
             f"{path}:{lines[0][0]}: {columns} fields: expected eight numbers, {TUM_LINE}; or KITTI's 12 numbers; or a "

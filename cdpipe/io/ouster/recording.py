@@ -24,6 +24,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, make_pose, require_poses
 from cdpipe.core.motion import Motion, make_motion
 from cdpipe.core.plugins import require_extra
+from cdpipe.io.foreign.trajectory import read_poses
 from cdpipe.io.ouster.beams import check_beams
 from cdpipe.io.ouster.captures import Progress, Recording, Revolution, open_recording
 from cdpipe.io.session import ScanChunk, SessionWriter, fit_chunk
@@ -78,7 +79,8 @@ def import_recording(
         source: The recording.
         out: The new folder.
         metadata: The sensor's metadata .json of a PCAP; default: the file of the same name next to it.
-        trajectory: TUM file with the sensor's poses, which replaces the recording's own.
+        trajectory: TUM, KITTI or CSV file with the sensor's poses, which replaces the recording's own. Without times
+            it has one pose for each revolution, at its first column.
         odometry: "kiss-icp" estimates the poses instead.
         on_progress: Called with the stage, the number of finished revolutions and their estimated total.
 
@@ -139,7 +141,10 @@ def _choose_motion(
     if trajectory is not None:
         # the vendor's tool writes one pose per revolution, at its first column
         slack_s = 1.5 / recording.sensor.rate_hz
-        return motion_along(trajectory, start_ns, int(times.last_ns[-1]), slack_s), f"trajectory {trajectory.name}"
+        rows = _pose_rows(trajectory, times)
+        return motion_along(
+            trajectory, start_ns, int(times.last_ns[-1]), slack_s, rows
+        ), f"trajectory {trajectory.name}"
     if odometry is not None:
         offsets_ns = recording.sensor.column_offsets_ns()
         column_s = (offsets_ns - offsets_ns[len(offsets_ns) // 2]) / 1e9
@@ -157,9 +162,30 @@ def _choose_motion(
     if times.has_own_pose.any():
         lack = f"{bare.size} of its {len(times.first_ns)} revolutions have no poses, the first of them number {bare[0]}"
     raise InputError(
-        f"{recording.path}: {lack}: give --trajectory FILE.tum (the sensor's poses, stamped by its clock), or "
+        f"{recording.path}: {lack}: give --trajectory FILE (the sensor's poses, stamped by its clock), or "
         f"--odometry {KISS_ICP} to estimate them"
     )
+
+
+def _pose_rows(trajectory: Path, times: _Times) -> Float64Array | None:
+    """Return the (N, 8) stamps and poses of a KITTI or CSV file, as rows of a TUM file; None of a TUM file.
+
+    Raises:
+        InputError: The file is no trajectory, or has no times and not one pose for each revolution.
+    """
+    found = read_poses(trajectory)
+    if found.is_tum:
+        return None
+    n_poses, n_revolutions = len(found.poses), len(times.first_ns)
+    if found.time_s is None and n_poses != n_revolutions:
+        raise InputError(
+            f"{trajectory}: {n_poses} poses without times for {n_revolutions} revolutions: one for each is needed"
+        )
+    if n_poses < 2:
+        raise InputError(f"{trajectory}: {n_poses} poses: a trajectory needs two or more")
+    stamps_s = times.first_ns / 1e9 if found.time_s is None else found.time_s
+    quaternions = Rotation.from_matrix(found.poses[:, :3, :3]).as_quat()
+    return np.column_stack([stamps_s, found.poses[:, :3, 3], quaternions])
 
 
 def _range_images(recording: Recording, n_scans: int, report: Progress) -> Iterator[npt.NDArray[np.uint32]]:

@@ -78,6 +78,11 @@ def list_reports(folder: Path) -> list[Report]:
     return found
 
 
+def _first_sentence(text: str) -> str:
+    words = " ".join(text.split())
+    return re.split(r"(?<=[.?!]) ", words, maxsplit=1)[0][:200]
+
+
 def _read_report(folder: Path, own: Path, questions: Mapping[str, str]) -> Report:
     name = own.relative_to(folder).as_posix()
     provenance = read_json(own / "provenance.json")
@@ -91,12 +96,14 @@ def _read_report(folder: Path, own: Path, questions: Mapping[str, str]) -> Repor
     linked = by_kind["notes"] if page in files else [path for paths in by_kind.values() for path in paths]
     return Report(
         name=name,
-        question=questions.get(name) or " ".join(str(described.get("description") or "").split())[:200],
+        question=questions.get(name) or _first_sentence(str(described.get("description") or "")),
         answer=_read_answer(page) if page in files else "",
         plan=", ".join(str(described[key]) for key in ("name", "split") if described.get(key)),
         finished=str(provenance.get("finished") or "")[:10],
         page=_address(folder, page) if page in files else first,
-        contents=", ".join(f"{len(paths)} {kind}" for kind, paths in by_kind.items() if paths),
+        contents=", ".join(
+            f"{len(paths)} {kind if len(paths) > 1 else kind[:-1]}" for kind, paths in by_kind.items() if paths
+        ),
         files=[(_address(folder, path), path.name) for path in linked],
     )
 

@@ -20,6 +20,7 @@ from cdpipe.io.readers import open_session
 from cdpipe.model.config import DescriptorConfig
 from cdpipe.model.types import DescriptorSet, ScanSource
 from eval.cli.main import main
+from eval.graft import making
 from eval.plans import plan as plans
 from eval.plans.plan import Plan
 from eval.report import page
@@ -27,7 +28,6 @@ from eval.running import runner
 from eval.running.pair_run import Tools
 from eval.running.runfolder import RunFolder
 from scenarios import load_scenario, scenario_names
-from sim.session import simulate
 
 Result = tuple[int, str, str]
 Command = Callable[..., Result]
@@ -479,7 +479,7 @@ def test_an_interrupt_elsewhere_says_that_nothing_was_written(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(simulate, "simulate_pair", interrupted)
+    monkeypatch.setattr(making, "simulate_pair", interrupted)
     assert command("simulate", "smoke/one_box", "--out", tmp_path / "out", "--quiet") == (
         130, "", "interrupted; nothing was written\n",
     )  # fmt: skip

@@ -67,7 +67,7 @@ def test_presets_and_sensors_are_described(command: Command, kind: str) -> None:
 
 def test_all_names_as_json(command: Command) -> None:
     found = json.loads(command("list", "--json")[1])
-    assert set(found) == {"scenarios", "props", "plans", "presets", "methods", "metrics", "sensors"}
+    assert set(found) == {"scenarios", "props", "plans", "presets", "methods", "metrics", "sensors", "recordings"}
     assert found["plans"] == plan_names()
 
 

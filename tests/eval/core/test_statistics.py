@@ -6,6 +6,7 @@ import pytest
 
 from cdpipe.core.geometry import stream
 from cdpipe.core.ranking import auroc
+from eval.core import statistics
 from eval.core.statistics import bootstrap_interval, summarise
 
 NAN = float("nan")
@@ -104,3 +105,13 @@ def test_pooled_ranking_is_that_of_all_keyframes_together() -> None:
     used = keyframes[keyframes["label"] >= 0]
     assert pooled["value"] == auroc(used["score"].to_numpy(), used["label"].to_numpy() == 1)
     assert (pooled["statistic"], pooled["n_used"]) == ("pooled", 3)
+
+
+def test_the_interval_of_many_pairs_is_that_of_gathered_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(1).normal(size=300)
+    for has_nan in (False, True):
+        values[:40] = np.nan if has_nan else values[:40]
+        gathered = statistics.bootstrap_interval(values)
+        with monkeypatch.context() as patch:
+            patch.setattr(statistics, "MANY_PAIRS", 100)
+            np.testing.assert_allclose(statistics.bootstrap_interval(values), gathered, rtol=1e-12)

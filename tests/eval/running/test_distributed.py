@@ -34,6 +34,7 @@ from eval.running.pair_run import Made, Tools
 from eval.running.run_workers import Task, _unfit, remove_traces, work_on
 from eval.running.runfolder import RunFolder, start_run_folder, write_json
 from eval.running.runner import RunOutcome, run_plan
+from eval.running.schedule import schedule_pairs
 
 distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
 HOOKED, ROOT = Path(__file__).parent / "hooked", Path(__file__).parents[3]
@@ -374,7 +375,7 @@ def test_a_machine_is_shared_where_two_tasks_run_at_a_time() -> None:
 def test_a_task_is_the_same_after_its_way_through_json(tmp_path: Path, name: str) -> None:
     plan = load_plan(name)
     plan = plan.model_copy(update={"seeds": plan.seeds[:1]})
-    for pair in runner._pairs(RunFolder(tmp_path), plan, expand_cells(plan), False, Tools()):
+    for pair in schedule_pairs(RunFolder(tmp_path), plan, expand_cells(plan), False, Tools()):
         task = Task(tmp_path, "token", pair, Made("commit"))
         came = TypeAdapter(Task).validate_json(task.as_json())
         assert came.as_json() == task.as_json()
@@ -452,7 +453,7 @@ def task_of(folder: Path, plan: Plan, **changes: Any) -> Task:
     """Make the task of the first pair of a plan, in a folder whose token it knows."""
     folder.mkdir(exist_ok=True)
     (folder / ".workers").write_text("token")
-    pair = runner._pairs(RunFolder(folder), plan, expand_cells(plan), False, Tools())[0]
+    pair = schedule_pairs(RunFolder(folder), plan, expand_cells(plan), False, Tools())[0]
     return replace(Task(folder, "token", pair, Made("commit", is_contended=True)), **changes)
 
 

@@ -129,7 +129,7 @@ def test_revolutions_without_poses_among_others_are_refused(tmp_path: Path) -> N
     made[2].body_to_world[:] = np.eye(4)
     path = write_frames(tmp_path / "hole.osf", info, made)
     told = said(lambda: import_recording(path, tmp_path / "t"))
-    assert "--trajectory FILE.tum" in told
+    assert "--trajectory FILE (" in told
     import_recording(path, tmp_path / "t", trajectory=write_tum(tmp_path / "t.tum", -0.05, 0.5))
 
 
@@ -146,7 +146,7 @@ def test_without_poses_it_says_what_to_give(tmp_path: Path) -> None:
     info = info_of(SENSOR)
     path = write_frames(tmp_path / "r.osf", info, frames(info, 2, lambda _: np.eye(4)))
     told = said(lambda: import_recording(path, tmp_path / "s"))
-    assert "--trajectory FILE.tum" in told
+    assert "--trajectory FILE (" in told
     assert "--odometry kiss-icp" in told
     assert left(tmp_path) == ["r.osf"]
     tum = tmp_path / "t.tum"
@@ -174,6 +174,34 @@ def test_a_pose_per_revolution_at_its_first_column_is_enough(tmp_path: Path) -> 
     tum = write_tum(tmp_path / "t.tum", 0.0, 0.25, rate_hz=10.0)
     import_recording(path, tmp_path / "s", trajectory=tum)
     np.testing.assert_allclose(read_session(tmp_path / "s").odom_T_sensor[2], odom_T_sensor(0.25), atol=5e-3)
+
+
+def write_kitti(path: Path, times_s: Float64Array) -> Path:
+    lines = [" ".join(f"{number:.9f}" for number in odom_T_sensor(time_s)[:3].ravel()) for time_s in times_s]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_kitti_poses_are_those_of_the_revolutions(tmp_path: Path) -> None:
+    info = info_of(SENSOR)
+    path = write_frames(tmp_path / "r.osf", info, frames(info, 3, lambda _: np.eye(4)))
+    import_recording(path, tmp_path / "s", trajectory=write_kitti(tmp_path / "k.txt", np.array([0.0, 0.1, 0.2])))
+    np.testing.assert_allclose(read_session(tmp_path / "s").odom_T_sensor[1], odom_T_sensor(0.15), atol=5e-3)
+    two = write_kitti(tmp_path / "two.txt", np.array([0.0, 0.1]))
+    told = said(lambda: import_recording(path, tmp_path / "t", trajectory=two))
+    assert "2 poses without times for 3 revolutions: one for each is needed" in told
+
+
+def test_a_csv_with_times_is_interpolated_as_a_tum_file_is(tmp_path: Path) -> None:
+    info = info_of(SENSOR)
+    path = write_frames(tmp_path / "r.osf", info, frames(info, 3, lambda _: np.eye(4)))
+    tum = write_tum(tmp_path / "t.tum", -0.05, 0.4)
+    rows = tum.read_text().replace(" ", ",")
+    (tmp_path / "t.csv").write_text("time,x,y,z,qx,qy,qz,qw\n" + rows)
+    import_recording(path, tmp_path / "a", trajectory=tum)
+    import_recording(path, tmp_path / "b", trajectory=tmp_path / "t.csv")
+    expected, got = (read_session(tmp_path / name).odom_T_sensor for name in "ab")
+    np.testing.assert_allclose(got, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(

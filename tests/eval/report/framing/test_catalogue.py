@@ -54,10 +54,10 @@ def test_a_report_is_what_its_files_say(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     one, two = list_reports(tmp_path)
     assert (one.question, one.answer, one.plan, one.finished) == (
-        "Who wins? And why.", "a <b> (1.00)", "main, sealed", "2026-11-25"
+        "Who wins?", "a <b> (1.00)", "main, sealed", "2026-11-25"
     )  # fmt: skip
     assert (one.page, one.contents, one.files) == (
-        "one/index.html", "1 notes, 1 tables", [("one/notes/a%20note.md", "a note.md")]
+        "one/index.html", "1 note, 1 table", [("one/notes/a%20note.md", "a note.md")]
     )  # fmt: skip
     assert (two.page, two.files) == ("", [("two/a.png", "a.png")])
     (tmp_path / "README.md").write_text("| [one](one) | What does `one` do? | x |\n")

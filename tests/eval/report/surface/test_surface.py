@@ -9,7 +9,7 @@ from cdpipe.core.geometry import make_pose, yaw_pose
 from cdpipe.surface import unroll
 from eval.report.page import write_page
 from eval.report.surface.surface import draw_surface
-from eval.running.rescoring import cell_document
+from eval.running.cell_file import cell_document
 from eval.running.run_data import read_run
 from eval.running.runfolder import RunFolder, write_json, write_tables
 from eval.scoring.scoring import CaseScore

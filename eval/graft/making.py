@@ -1,0 +1,127 @@
+"""Pairs of a scenario: simulated, or grafted into the recordings that the scenario names."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from cdpipe.core.errors import InputError, MergeFailedError, ScenarioError
+from cdpipe.core.geometry import Float64Array
+from cdpipe.io.foreign import HowToRead, guess_format
+from cdpipe.io.foreign.sniff import OUSTER
+from cdpipe.io.known_merge import read_known_merge
+from cdpipe.io.ouster.recording import import_recording
+from cdpipe.io.readers import RecordedScans, open_session
+from cdpipe.io.session import Session, read_session
+from cdpipe.model.config import load_config
+from cdpipe.pipeline import Hooks, detect_merge, map_pair
+from eval.core.output import new_folder
+from eval.graft.clouds import as_session
+from scenarios.grafted import GraftScenario, Recording
+from scenarios.references import file_digests
+from scenarios.schema import Scenario, SessionPlan
+from sim.graft import Recorded, graft_in_memory, graft_pair
+from sim.session.simulate import HeldPair, simulate_pair
+from sim.story.afters import simulate_afters
+
+OnStage = Callable[[str, int, int], None]
+
+
+def make_pair(scenario: Scenario, seed: int, out: Path, on_progress: OnStage = lambda stage, done, total: None) -> None:
+    """Write the pair of a scenario into a folder that does not exist or is empty: `before`, `after` and `truth`.
+
+    Raises:
+        InputError: As `simulate_pair`; or a recording cannot be read or split.
+        ScenarioError: The world contradicts itself; or a prop finds no place, or the recordings cannot be merged.
+    """
+    if not isinstance(scenario, GraftScenario):
+        simulate_pair(scenario, seed, out, on_progress)
+        return
+    files = file_digests(scenario)
+    sessions = [files[name] for name in scenario.recording.sessions]
+    if len(set(sessions)) < len(sessions):
+        raise InputError(f"{' and '.join(scenario.recording.sessions)}: one and the same recording: name it once")
+    with new_folder(out) as partial, open_recorded(scenario.recording, on_progress) as recorded:
+        graft_pair(scenario, seed, recorded, files, partial, on_progress)
+
+
+def make_afters(scenario: Scenario, plans: Sequence[SessionPlan], seed: int) -> Iterator[HeldPair]:
+    """Yield the pair of a scenario in memory, and one for each further after session, as `simulate_afters` does.
+
+    Raises:
+        InputError: As `make_pair`.
+        ScenarioError: As `make_pair`; or a recording is asked for further after sessions.
+    """
+    if not isinstance(scenario, GraftScenario):
+        yield from simulate_afters(scenario, plans, seed)
+        return
+    if plans:
+        raise ScenarioError(f"{scenario.family}: its sessions are recorded: leave out `--afters`")
+    with open_recorded(scenario.recording) as recorded:
+        yield graft_in_memory(scenario, seed, recorded, file_digests(scenario))
+
+
+@contextmanager
+def open_recorded(recording: Recording, on_progress: OnStage = lambda stage, done, total: None) -> Iterator[Recorded]:
+    """Open the recordings of a pair, and find their merge where it is not given.
+
+    Raises:
+        InputError: One cannot be read, or the file of the merge holds none, or no merge is found.
+    """
+    with tempfile.TemporaryDirectory(prefix="tunnelcd-graft-") as folder:
+        sessions = tuple(
+            _open(Path(name), _how(recording, number), Path(folder) / str(number), on_progress)
+            for number, name in enumerate(recording.sessions)
+        )
+        if len(sessions) == 1:
+            yield Recorded(sessions)
+        elif recording.before_T_after is not None:
+            yield Recorded(sessions, read_known_merge(Path(recording.before_T_after)), "given")
+        else:
+            yield Recorded(sessions, _find_merge(sessions, on_progress), "tunnelcd")
+
+
+def _how(recording: Recording, number: int) -> HowToRead:
+    trajectory = Path(recording.trajectories[number]) if recording.trajectories else None
+    metadata = Path(recording.metadata[number]) if recording.metadata else None
+    told = recording.format, recording.topics, trajectory, recording.odometry, metadata, recording.deskew
+    return HowToRead(*told)
+
+
+def _open(path: Path, how: HowToRead, folder: Path, on_progress: OnStage) -> Session:
+    """Open a recording as a session; an OSF or PCAP is written into a folder first."""
+    name = how.format or guess_format(path)
+    if name == "session":
+        open_session(path, how)  # which refuses options that a session has no use for
+        return read_session(path)
+    if name not in OUSTER:
+        return as_session(open_session(path, how, on_progress))
+    folder.mkdir()
+    session = folder / path.name
+    import_recording(
+        path,
+        session,
+        metadata=how.metadata,
+        trajectory=how.trajectory,
+        odometry=how.odometry,
+        on_progress=on_progress,
+    )
+    return read_session(session)
+
+
+def _find_merge(sessions: tuple[Session, ...], on_progress: OnStage) -> Float64Array:
+    """Return `before_T_after` (4, 4) as preset `tunnelcd` finds it.
+
+    Raises:
+        InputError: It is refused.
+    """
+    config, hooks = load_config("tunnelcd"), Hooks(on_progress)
+    sources = [RecordedScans(session) for session in sessions]
+    try:
+        report = detect_merge(*map_pair(sources, config, hooks).value, config, hooks)
+    except MergeFailedError as error:
+        names = " and ".join(str(session.path) for session in sessions)
+        raise InputError(f"{names}: {error}: give their merge with --before-T-after FILE") from error
+    return report.before_T_after

@@ -1,0 +1,1 @@
+"""Runs beyond one disk and one machine: shards and their union, sessions made again, copies elsewhere, large tables."""

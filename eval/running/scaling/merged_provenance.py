@@ -1,0 +1,111 @@
+"""The provenance of united runs, and whether they may be united: one plan, one set of versions, weights and threads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from cdpipe.core.errors import InputError
+
+_MUST_AGREE = ("format_version", "seeds", "plan", "plan_digest", "versions", "config_digests", "checkpoints")
+_WORDS = {
+    "versions": "versions of packages", "config_digests": "settings", "checkpoints": "weights", "seeds": "seeds",
+    "plan": "plans", "plan_digest": "plans", "format_version": "formats",
+}  # fmt: skip
+_TOLD = 4
+# No row depends on these.
+_IDLE_PACKAGES = ("ouster-sdk", "viser", "distributed")
+
+
+def unite_provenance(
+    names: Sequence[str], told: Sequence[Mapping[str, Any]], command: str
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the provenance of united runs, and what is worth a note.
+
+    `started` and `finished` are the first and the last, `parts` tells of each run its folder, shard, times, command,
+    commit and machine. The machine is the common one; where there are several, the fields that differ name all.
+
+    Args:
+        names: The folders.
+        told: The provenance of each.
+        command: The command that unites them.
+
+    Raises:
+        InputError: Two of them differ in what rows depend on.
+    """
+    for name, other in zip(names[1:], told[1:], strict=True):
+        _require_alike(names[0], told[0], name, other)
+    parts = [part for name, each in zip(names, told, strict=True) for part in _parts(name, each)]
+    commits = list(dict.fromkeys(str(each.get("git_commit")) for each in told))
+    notes = [] if len(commits) == 1 else [f"the runs are of several commits: {', '.join(commits)}"]
+    if unfinished := [name for name, each in zip(names, told, strict=True) if not each.get("finished")]:
+        notes.append(f"not finished when they were united: {', '.join(unfinished)}")
+    united = {key: value for key, value in told[0].items() if key not in ("shard", "parts")}
+    united |= {
+        "started": min(str(each.get("started")) for each in told),
+        "command": command,
+        "git_commit": told[0].get("git_commit") if len(commits) == 1 else None,
+        "machine": _unite_machines([each.get("machine") for each in told]),
+        "parts": parts,
+    }
+    return united, notes
+
+
+def _require_alike(name: str, first: Mapping[str, Any], other_name: str, other: Mapping[str, Any]) -> None:
+    for key in _MUST_AGREE:
+        one, two = (_comparable(key, each) for each in (first, other))
+        if one != two:
+            raise InputError(
+                f"{name} and {other_name}: of different {_WORDS[key]} ({_name_difference(one, two)}): rows of both in "
+                "one table would mean different things; run them alike"
+            )
+    threads = [_threads(each) for each in (first, other)]
+    if threads[0] != threads[1]:
+        raise InputError(
+            f"{name} and {other_name}: of different threads of the numeric libraries "
+            f"({_name_difference(*threads)}): their rows may differ in the last digits; run them alike"
+        )
+
+
+def _comparable(key: str, provenance: Mapping[str, Any]) -> Any:
+    value = provenance.get(key)
+    if key == "versions" and isinstance(value, Mapping):
+        return {name: version for name, version in value.items() if name not in _IDLE_PACKAGES}
+    return value
+
+
+def _threads(provenance: Mapping[str, Any]) -> Any:
+    machine = provenance.get("machine")
+    return machine.get("threads") if isinstance(machine, Mapping) else None
+
+
+def _name_difference(one: Any, two: Any) -> str:
+    """Return the first keys at which two values differ, with both values."""
+    if not (isinstance(one, Mapping) and isinstance(two, Mapping)):
+        return f"{one!r:.60} and {two!r:.60}"
+    keys = [key for key in {**one, **two} if one.get(key) != two.get(key)]
+    named = [f"{key}: {one.get(key, 'none')!r:.60} and {two.get(key, 'none')!r:.60}" for key in keys[:_TOLD]]
+    more = f", and {len(keys) - _TOLD} more" if len(keys) > _TOLD else ""
+    return ", ".join(named) + more
+
+
+def _parts(name: str, provenance: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return what is told of a run in the union; a union tells of its own parts."""
+    if isinstance(parts := provenance.get("parts"), list):
+        return [dict(part) for part in parts if isinstance(part, Mapping)]
+    keys = ("shard", "started", "finished", "command", "git_commit", "machine")
+    return [{"folder": name, **{key: provenance.get(key) for key in keys}}]
+
+
+def _unite_machines(machines: Sequence[Any]) -> Any:
+    if all(machine == machines[0] for machine in machines):
+        return machines[0]
+    known = [machine for machine in machines if isinstance(machine, Mapping)]
+    keys = list(dict.fromkeys(key for machine in known for key in machine))
+    return {key: _unite_field([machine.get(key) for machine in known]) for key in keys}
+
+
+def _unite_field(values: Sequence[Any]) -> Any:
+    if all(value == values[0] for value in values):
+        return values[0]
+    return " and ".join(dict.fromkeys(str(value) for value in values))

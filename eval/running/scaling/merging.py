@@ -1,0 +1,272 @@
+"""Unites run folders of one plan: the shards of a run, or parts of it that machines made.
+
+Every finished cell comes into the new folder once, with its answer. A cell that two folders hold must be the same in
+both: its key, its row and items, and its answer, times apart. Sessions and maps come along as hard links where the
+disks allow it, else as copies. Stored stages and the names of `tunnelcd export` stay behind. The new folder appears
+when it is complete.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.files import read_json, read_npz
+from eval.core.output import new_folder
+from eval.core.progress import RunProgress, Silent
+from eval.core.provenance import digest, now
+from eval.plans.coverage import read_stored_plan
+from eval.plans.plan import list_planned_cases
+from eval.running.cell_rows import ITEM_TABLES, SURFACE_TABLES
+from eval.running.runfolder import RunFolder, open_run_folder, write_json, write_tables
+from eval.running.scaling.keeping import read_dropped
+from eval.running.scaling.merged_provenance import unite_provenance
+from eval.running.scaling.shards import number_pairs, stored_shard
+
+_ANSWER = ("answer.json", "answer.npz")
+
+
+@dataclass(frozen=True, slots=True)
+class Union:
+    """What was united.
+
+    Attributes:
+        n_cells: Finished cells in the new folder.
+        n_shared: Of them, those that several folders held.
+        notes: What a reader should know: shards and pairs that are missing, code that differs.
+    """
+
+    n_cells: int
+    n_shared: int
+    notes: tuple[str, ...]
+
+
+def merge_runs(
+    folders: Sequence[Path],
+    out: Path,
+    *,
+    command: str = "",
+    names: Sequence[str] = (),
+    keep: Literal["sessions", "answers"] = "sessions",
+    progress: RunProgress | None = None,
+) -> Union:
+    """Unite run folders into a new one, and write its tables.
+
+    Args:
+        folders: Two or more run folders of one plan.
+        out: A new or empty folder.
+        command: The command line, for the provenance.
+        names: What the provenance calls the folders, else their paths.
+        keep: Whether sessions and maps come along.
+        progress: Receives the progress.
+
+    Raises:
+        InputError: A folder is no run, the runs are not of one plan, version, machine setting or set of weights, a cell
+            differs between two of them, none is finished, or `out` holds something.
+    """
+    runs, progress = _open_runs(folders), progress or Silent()
+    told = [run.provenance() for run in runs]
+    provenance, notes = unite_provenance(list(names) or [str(run.path) for run in runs], told, command)
+    _require_outside(out, runs)
+    sources, n_shared = _find_cells(runs, progress)
+    with new_folder(out) as partial:
+        merged = RunFolder(partial)
+        write_json(partial / "provenance.json", {**provenance, "finished": None})
+        for done, (name, run) in enumerate(sources.items()):
+            progress.cells(name, done, len(sources))
+            _take_cell(run.path, partial, Path(name))
+        if keep == "sessions":
+            _take_pairs(runs, partial, progress)
+        _take_records(runs, partial)
+        write_tables(merged)
+        write_json(partial / "provenance.json", {**provenance, "finished": now()})
+    progress.cells("done", len(sources), len(sources))
+    return Union(len(sources), n_shared, (*notes, *_missing(RunFolder(out), told)))
+
+
+def _open_runs(folders: Sequence[Path]) -> list[RunFolder]:
+    if len(folders) < 2:
+        raise InputError("merge-runs unites two run folders or more: name them all")
+    runs = [open_run_folder(folder) for folder in folders]
+    places = Counter(run.path.resolve() for run in runs)
+    if twice := [str(path) for path, n in places.items() if n > 1]:
+        raise InputError(f"{twice[0]}: is named twice: name each run folder once")
+    return runs
+
+
+def _require_outside(out: Path, runs: Sequence[RunFolder]) -> None:
+    place = Path(os.path.realpath(out))
+    for run in runs:
+        if place.is_relative_to(run.path.resolve()):
+            raise InputError(f"{out}: lies in the run folder {run.path}: name a folder outside of it")
+
+
+def _find_cells(runs: Sequence[RunFolder], progress: RunProgress) -> tuple[dict[str, RunFolder], int]:
+    """Return the run that gives each finished cell, by the cell's file, and how many cells several runs hold."""
+    sources: dict[str, RunFolder] = {}
+    seen: dict[str, str] = {}
+    shared, versions = set(), dict[str, Path]()
+    for place, run in enumerate(runs):
+        progress.stage("cells compared", place, len(runs))
+        for path in sorted(run.path.glob("cells/*/*/*.json")):
+            name = path.relative_to(run.path).as_posix()
+            cell = run.read_cell(path)
+            if cell is None:
+                continue
+            _require_one_name(seen, name, cell, run)
+            if name in sources:
+                _require_same(name, sources[name], run, cell)
+                shared.add(name)
+            sources.setdefault(name, run)
+            versions.setdefault(str(cell["row"].get("metrics_version")), run.path)
+    if len(versions) > 1:
+        told = ", ".join(f"{where}: metrics version {version}" for version, where in versions.items())
+        raise InputError(f"{told}: their columns do not mean the same: `tunnelcd score` scores a run again")
+    if not sources:
+        raise InputError(f"{', '.join(str(run.path) for run in runs)}: no finished cell in any of them")
+    return sources, len(shared)
+
+
+def _require_one_name(seen: dict[str, str], name: str, cell: Mapping[str, Any], run: RunFolder) -> None:
+    """Refuse two worlds or variants that share a file, also where a disk takes upper and lower case as one."""
+    case = "{scenario} {seed} {variant}".format(**cell["row"])
+    if (other := seen.setdefault(name.casefold(), case)) != case:
+        raise InputError(f"{run.path / name}: holds {case}, and another folder has {other} there: rename one")
+
+
+def _require_same(name: str, first: RunFolder, second: RunFolder, cell: Mapping[str, Any]) -> None:
+    """Refuse a cell of which two runs hold different results."""
+    other = first.read_cell(first.path / name)
+    difference = "one of the files is damaged" if other is None else next(find_differences(other, cell), "")
+    answers = [run.path / "answers" / Path(name).relative_to("cells").with_suffix("") for run in (first, second)]
+    if not difference and _digest_answer(answers[0]) != _digest_answer(answers[1]):
+        difference = "the stored answers"
+    if difference:
+        case = "{scenario} {seed} {variant}".format(**cell["row"])
+        raise InputError(
+            f"{case}: {first.path} and {second.path} hold different results ({difference}): remove the cell from one, "
+            "or run it again there with --force"
+        )
+
+
+def is_time(column: str) -> bool:
+    """Tell whether a column says when, by which code or how fast a row was made."""
+    return column.startswith("t_") or column in ("commit", "is_contended")
+
+
+def find_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what differs between two cells, times apart."""
+    if first["key"] != second["key"]:
+        yield f"scenario, settings, weights or extras: key {first['key']} and {second['key']}"
+    for table in ("row", *ITEM_TABLES, *SURFACE_TABLES):
+        rows = [cell.get(table) or [] for cell in (first, second)]
+        ones, others = ([each] if isinstance(each, dict) else each for each in rows)
+        if len(ones) != len(others):
+            yield f"{len(ones)} and {len(others)} rows of {table}"
+            continue
+        for number, (one, other) in enumerate(zip(ones, others, strict=True)):
+            where = "" if table == "row" else f"{table} {number}: "
+            names = [name for name in {**one, **other} if not is_time(name)]
+            yield from (
+                f"{where}{name} = {one.get(name)!r} and {other.get(name)!r}"
+                for name in names
+                if digest(one.get(name)) != digest(other.get(name))
+            )
+
+
+def _digest_answer(folder: Path) -> str:
+    """Return the digest of a stored answer without its seconds; "" where there is none."""
+    document, arrays = (folder / name for name in _ANSWER)
+    if not document.is_file():
+        return ""
+    # the key of the cell stands for its settings, which name weights by their place on one machine
+    found = read_json(document, "expected an answer written by `tunnelcd run`")
+    told = {name: value for name, value in found.items() if name not in ("seconds", "config")}
+    stored = read_npz(arrays, lambda types: None) if arrays.is_file() else {}
+    content = {name: hashlib.sha256(array.tobytes()).hexdigest() for name, array in stored.items()}
+    return digest([told, content, {name: [array.dtype.str, *array.shape] for name, array in stored.items()}])
+
+
+def _take_cell(source: Path, target: Path, name: Path) -> None:
+    """Copy the answer of a cell and then the cell."""
+    answer = Path("answers", *name.parts[1:]).with_suffix("")
+    if (source / answer).is_dir():
+        (target / answer).mkdir(parents=True)
+        for file in _ANSWER:
+            if (source / answer / file).is_file():
+                shutil.copyfile(source / answer / file, target / answer / file)
+    (target / name).parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source / name, target / name)
+
+
+def _take_pairs(runs: Sequence[RunFolder], target: Path, progress: RunProgress) -> None:
+    """Link or copy the pairs and maps; of a pair that several runs hold, those of the first."""
+    found: dict[str, Path] = {}
+    for run in runs:
+        for truth in sorted(run.path.glob("pairs/*/*/truth/changes.json")):
+            found.setdefault(truth.parents[1].relative_to(run.path).as_posix(), truth.parents[1])
+        for path in sorted(run.path.glob("maps/*/*.npz")):
+            found.setdefault(path.relative_to(run.path).as_posix(), path)
+    for done, (name, path) in enumerate(found.items()):
+        progress.stage("sessions", done, len(found))
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            shutil.copytree(path, target / name, copy_function=_link_or_copy)
+        else:
+            _link_or_copy(path, target / name)
+
+
+def _take_records(runs: Sequence[RunFolder], target: Path) -> None:
+    """Copy the records of removed sessions, which must agree."""
+    digests: dict[str, tuple[str, Path]] = {}
+    for run in runs:
+        for path in sorted(run.path.glob("dropped/*/*.json")):
+            name, record = path.relative_to(run.path).as_posix(), read_dropped(path)
+            if record is None:
+                continue
+            other, where = digests.setdefault(name, (record.digest, run.path))
+            if other != record.digest:
+                raise InputError(
+                    f"{record.world} {record.seed}: {where} and {run.path} answered different sessions (digest {other} "
+                    f"and {record.digest}): run it again in one of them with --force"
+                )
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, target / name)
+
+
+def _link_or_copy(source: str | Path, target: str | Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
+def _missing(run: RunFolder, told: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return one sentence for the shards that are missing, and one for pairs that are not finished."""
+    plan = read_stored_plan(run.provenance())
+    if plan is None:
+        return []
+    planned = list_planned_cases(plan)
+    done = {tuple(cell["row"][name] for name in ("scenario", "seed", "variant")) for cell in run.each_cell()}
+    lacking = {case[:2] for case in planned if case not in done}
+    if not lacking:
+        return []
+    shards = [stored_shard(each) for each in told]
+    counts = {shard.n for shard in shards if shard is not None}
+    if None not in shards and len(counts) == 1:
+        (n,) = counts
+        absent = sorted({*range(1, n + 1)} - {shard.index for shard in shards if shard is not None})
+        named = [f"shard {index}/{n} is missing" for index in absent]
+    else:
+        named = []
+    order = number_pairs((world.label, seed) for world in plan.worlds for seed in plan.seeds[: world.n_seeds])
+    first = min(lacking, key=lambda pair: order.get(pair, 0))
+    pairs = f"{len(lacking)} of {len(order)} planned pairs are not finished, the first is {first[0]} {first[1]}"
+    return [*named, f"{pairs}: run them into the new folder, or merge the rest"]

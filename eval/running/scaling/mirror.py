@@ -1,0 +1,188 @@
+"""A copy of rows and answers at a URL of fsspec: a bucket, another machine, another disk, or memory.
+
+A run works in its own folder, on a disk of its machine. After each pair it copies the answers of the pair and then its
+cells, and the tables at the end. A run that begins takes the finished cells from there, so it goes on where an earlier
+one on another machine ended. Sessions, maps and stages are not copied: they can be made again.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.files import parse_json
+from cdpipe.core.files.json_file import MAX_BYTES
+from eval.core.output import whole_file
+from eval.core.progress import RunProgress, Silent
+from eval.core.provenance import TOOL
+from eval.running.pair_run import Pair
+from eval.running.runfolder import RunFolder
+
+_ANSWER = ("answer.npz", "answer.json")
+_PART = r"(?!\.)[A-Za-z0-9._=,-]{1,210}"
+_CELL = re.compile(rf"cells/{_PART}/\d{{1,15}}/{_PART}\.json", re.ASCII)
+_STORED_ANSWER = re.compile(rf"answers/{_PART}/\d{{1,15}}/{_PART}/answer\.(json|npz)", re.ASCII)
+_MAX_ANSWER_BYTES = 1 << 30
+
+
+class Mirror:
+    """Rows and answers of a run at a URL.
+
+    Args:
+        url: What fsspec understands, `s3://bucket/run`, `sftp://host/run`, `memory://run`, or a folder.
+
+    Raises:
+        InputError: fsspec does not know it, or a package for it is missing.
+    """
+
+    def __init__(self, url: str) -> None:
+        if urlsplit(url).password is not None:
+            raise InputError("a URL with a password would stand in provenance.json: leave it to fsspec's configuration")
+        self.url = url
+        self._fs, self._root = _open(url)
+
+    def provenance(self) -> dict[str, Any]:
+        """Return the provenance of the run there; {} where there is none.
+
+        Raises:
+            InputError: Something else is there.
+        """
+        with self._told():
+            is_there, path = self._fs.exists(self._place("provenance.json")), self._place("provenance.json")
+            content = self._read(path, MAX_BYTES) if is_there else b"{}"
+            is_used = not is_there and self._fs.exists(self._root) and bool(self._fs.find(self._root))
+        if is_used:
+            raise InputError(f"{self.url}: not empty and not a copy of a run: name another place")
+        try:
+            document = parse_json(content)
+        except ValueError as error:
+            raise InputError(f"{self.url}/provenance.json: damaged, not JSON ({error}): name another place") from error
+        if is_there and (not isinstance(document, dict) or document.get("tool") != TOOL):
+            raise InputError(f"{self.url}/provenance.json: not written by {TOOL}: name another place")
+        return dict(document)
+
+    def fetch(self, run: RunFolder, progress: RunProgress | None = None) -> None:
+        """Take the finished cells that the folder lacks.
+
+        Raises:
+            InputError: They cannot be read.
+        """
+        names = [name for name in self._list("cells") if _CELL.fullmatch(name) and not (run.path / name).exists()]
+        self._get(run.path, names, progress or Silent())
+
+    def fetch_all(self, folder: Path, progress: RunProgress | None = None) -> None:
+        """Take provenance, cells and answers into an empty folder.
+
+        Raises:
+            InputError: There is no run there, or it cannot be read.
+        """
+        if not self.provenance():
+            raise InputError(f"{self.url}: no copy of a run is there (no provenance.json)")
+        names = [name for name in self._list("cells") if _CELL.fullmatch(name)]
+        names += [name for name in self._list("answers") if _STORED_ANSWER.fullmatch(name)]
+        self._get(folder, [*names, "provenance.json"], progress or Silent())
+
+    def forget(self, run: RunFolder, pairs: Iterable[Pair]) -> None:
+        """Remove cells that are about to run again, so that no later run takes the old ones.
+
+        Raises:
+            InputError: They cannot be removed.
+        """
+        stored = set(self._list("cells"))
+        todo = ((pair, each.cell.variant) for pair in pairs for each in pair.todo)
+        names = (_relative(run, run.cell(pair.name, pair.seed, variant)) for pair, variant in todo)
+        with self._told():
+            for name in names:
+                if name in stored:
+                    self._fs.rm_file(self._place(name))
+
+    def copy_pair(self, run: RunFolder, pair: Pair) -> None:
+        """Copy the answers of a pair's cells, and then the cells, whose files say that they are finished.
+
+        Raises:
+            InputError: The place cannot be written.
+        """
+        for each in pair.todo:
+            names = pair.name, pair.seed, each.cell.variant
+            answer = run.answer(*names)
+            found = [answer / name for name in _ANSWER if (answer / name).is_file()]
+            self._put(run, [*found, run.cell(*names)])
+
+    def copy_tables(self, run: RunFolder) -> None:
+        """Copy provenance and tables.
+
+        Raises:
+            InputError: The place cannot be written.
+        """
+        tables = [*sorted(run.path.glob("*.csv")), *sorted(run.path.glob("*.parquet/*.parquet"))]
+        self._put(run, [*tables, run.path / "provenance.json"])
+
+    def _put(self, run: RunFolder, files: Sequence[Path]) -> None:
+        with self._told():
+            for file in files:
+                place = self._place(_relative(run, file))
+                self._fs.makedirs(place.rpartition("/")[0], exist_ok=True)
+                self._fs.put_file(str(file), place)
+
+    def _get(self, folder: Path, names: Sequence[str], progress: RunProgress) -> None:
+        for done, name in enumerate(names):
+            progress.stage(f"from {self.url}", done, len(names))
+            with self._told():
+                content = self._read(self._place(name), MAX_BYTES if name.endswith(".json") else _MAX_ANSWER_BYTES)
+            with whole_file(folder / name) as partial:
+                partial.write_bytes(content)
+        progress.stage(f"from {self.url}", len(names), len(names))
+
+    def _read(self, place: str, most_bytes: int) -> bytes:
+        size = self._fs.size(place)
+        if size is None or size > most_bytes:
+            raise InputError(f"{place}: {size} bytes, more than the {most_bytes} that it may have")
+        return bytes(self._fs.cat_file(place))
+
+    def _list(self, folder: str) -> list[str]:
+        """Return the files below a folder, by their names below the root."""
+        with self._told():
+            place = self._place(folder)
+            found = self._fs.find(place) if self._fs.exists(place) else []
+            return sorted(str(name).rpartition(f"{self._root}/")[2] for name in found)
+
+    def _place(self, name: str) -> str:
+        return f"{self._root}/{name}"
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """Turn whatever a file system raises into one line."""
+        try:
+            yield
+        except InputError:
+            raise
+        except Exception as error:
+            said = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise InputError(f"{self.url}: {said:.200}: what is finished is kept in the run folder") from error
+
+
+def is_url(text: str) -> bool:
+    """Tell whether a run is named by a URL and not by its folder."""
+    return "://" in text
+
+
+def _open(url: str) -> tuple[Any, str]:
+    from fsspec.core import url_to_fs  # noqa: PLC0415 - slow to import
+
+    try:
+        fs, root = url_to_fs(url)
+    except ImportError as error:
+        raise InputError(f"{url}: {error!s:.200}") from error
+    except Exception as error:  # whatever a file system raises
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{url}: no place that fsspec can open: {said:.200}") from error
+    return fs, str(root).rstrip("/")
+
+
+def _relative(run: RunFolder, path: Path) -> str:
+    return path.relative_to(run.path).as_posix()

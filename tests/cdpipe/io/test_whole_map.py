@@ -1,0 +1,94 @@
+"""Whole maps without their scans: where stations stand, what can be compared, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpipe import detect
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, stream
+from cdpipe.io.foreign.whole_map import find_stations
+from cdpipe.io.ply import write_ply_points
+from cdpipe.io.readers import open_session
+
+WIDTH_M, HEIGHT_M, LENGTH_M = 4.0, 3.0, 24.0
+BOX_M = np.array([12.0, 0.8, 0.0])
+SETTINGS = ("query.threshold=20", "regions.min_points=8")
+
+
+def drift(sample: int, *, has_roof: bool = True, has_box: bool = False) -> Float64Array:
+    """(N, 3) points of a drift along x, floor at z = 0, with false returns in the rock around it."""
+    rng = stream(sample, "drift")
+    n = 60_000
+    along = rng.uniform(0, LENGTH_M, n)
+    sides = rng.integers(0, 4 if has_roof else 3, n)
+    across, up = rng.uniform(-WIDTH_M / 2, WIDTH_M / 2, n), rng.uniform(0, HEIGHT_M, n)
+    y = np.select([sides == 1, sides == 2], [np.full(n, -WIDTH_M / 2), np.full(n, WIDTH_M / 2)], across)
+    z = np.select([sides == 0, sides == 3], [np.zeros(n), np.full(n, HEIGHT_M)], up)
+    points = np.column_stack([along, y, z]) + rng.normal(0, 0.005, (n, 3))
+    strays = rng.uniform((-10, -20, -20), (LENGTH_M + 10, 20, 20), (60, 3))
+    box = BOX_M + rng.uniform((-0.5, -0.5, 0), (0.5, 0.5, 1.0), (4000, 3)) if has_box else np.zeros((0, 3))
+    return np.concatenate([points, strays, box])
+
+
+def write(path: Path, points: Float64Array) -> Path:
+    write_ply_points(path, points)
+    return path
+
+
+@pytest.mark.parametrize("has_roof", [True, False])
+def test_stations_stand_on_the_middle_line(has_roof: bool) -> None:
+    stations = find_stations(drift(1, has_roof=has_roof))
+    assert np.all(np.abs(stations[:, 1]) < 0.8)
+    assert np.all(np.abs(stations[:, 2] - 1.0) < 0.35)
+    assert stations[:, 0].min() < 2 and stations[:, 0].max() > LENGTH_M - 2
+    steps_m = np.linalg.norm(np.diff(stations, axis=0), axis=1)
+    assert steps_m.max() < 3.5
+
+
+def test_the_stations_of_the_same_map_are_the_same() -> None:
+    assert np.array_equal(find_stations(drift(1)), find_stations(drift(1)))
+
+
+def test_a_map_is_opened_as_stations_that_hold_every_point(tmp_path: Path) -> None:
+    points = drift(1)
+    source = open_session(write(tmp_path / "map.ply", points))
+    read = np.concatenate([scan.points_sensor + scan.odom_T_sensor[:3, 3] for scan in source.scans()])
+    assert len(read) == len(points)
+    assert np.allclose(np.sort(read[:, 0]), np.sort(points[:, 0]), atol=1e-4)
+
+
+def test_a_box_that_was_added_is_found(tmp_path: Path) -> None:
+    before = write(tmp_path / "before.ply", drift(1))
+    after = write(tmp_path / "after.ply", drift(2, has_box=True))
+    report = detect(before, after, "c2c", SETTINGS, before_T_after=np.eye(4))
+    (found,) = report.objects
+    assert found.kind == "added"
+    assert np.allclose(found.points_map.mean(axis=0)[:2], BOX_M[:2], atol=0.4)
+    assert report.coverage is not None
+
+
+def test_unchanged_maps_have_no_object(tmp_path: Path) -> None:
+    maps = [write(tmp_path / f"{sample}.ply", drift(sample)) for sample in (1, 2)]
+    assert detect(*maps, "c2c", SETTINGS, before_T_after=np.eye(4)).objects == ()
+
+
+def test_what_asks_for_free_space_is_refused(tmp_path: Path) -> None:
+    maps = [write(tmp_path / f"{sample}.ply", drift(sample)) for sample in (1, 2)]
+    with pytest.raises(InputError, match=r"without its scans.*use --preset m3c2, c2c or voxel-diff"):
+        detect(*maps, before_T_after=np.eye(4))
+
+
+def test_a_merge_that_is_not_known_is_refused(tmp_path: Path) -> None:
+    maps = [write(tmp_path / f"{sample}.ply", drift(sample)) for sample in (1, 2)]
+    with pytest.raises(InputError, match="say --assume-aligned"):
+        detect(*maps, "c2c")
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), stream(1, "dust").uniform(0, 30, (500, 3))])
+def test_a_map_without_a_floor_is_refused(tmp_path: Path, points: Float64Array) -> None:
+    with pytest.raises(InputError, match=r"no floor with 1\.2 m of free height"):
+        open_session(write(tmp_path / "map.ply", points))

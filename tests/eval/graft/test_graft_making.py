@@ -1,0 +1,169 @@
+"""Recordings of every kind as worlds of pairs, by the command line and from Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import invert, transform
+from cdpipe.io.readers import RecordedScans, open_session
+from cdpipe.io.session import read_session
+from cdpipe.pipeline import detect
+from eval.graft.adapters import list_adapters, locate_recording
+from eval.graft.clouds import as_session
+from eval.graft.making import make_pair
+from eval.scoring import score
+from scenarios.grafted import GraftScenario, Recording
+from scenarios.library import load_scenario
+from scenarios.schema import Prop, Scenario
+from sim.session.truth import read_pair_truth, read_true_poses
+
+SMALL = ("sensor.mode=512x10", "platform.scan_spacing_m=1.0")
+SEED = 10003
+Command = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def simulated(simulated_once: Callable[[Scenario, int], Path]) -> Path:
+    return simulated_once(load_scenario("smoke/unchanged", SEED, SMALL), SEED)
+
+
+def graft(*sessions: Path, props: tuple[Prop, ...] = (), **override: object) -> GraftScenario:
+    recording = Recording(sessions=tuple(map(str, sessions)), **{"reach_m": 4.0, "clearance_m": 0.5, **override})
+    return GraftScenario(family="test", props=props, recording=recording)
+
+
+def boxes(n: int) -> tuple[Prop, ...]:
+    return tuple(Prop(name=f"box-{k}", kind="box", size_m=(0.8, 0.7, 0.7), change="added") for k in range(n))
+
+
+def test_what_is_grafted_is_found_and_the_null_pair_is_silent(simulated: Path, tmp_path: Path) -> None:
+    found = {}
+    for name, props in (("changed", boxes(2)), ("null", ())):
+        pair = tmp_path / name
+        make_pair(graft(simulated / "before", props=props, split="alternate"), SEED, pair)
+        report = detect(pair / "before", pair / "after", "every-keyframe", before_T_after=np.eye(4))
+        found[name] = score(report, pair)
+    assert found["changed"]["region_recall"] == 1
+    assert found["changed"]["object_iou_point"] > 0.6
+    assert found["changed"]["merge_error_m"] < 0.02
+    assert found["null"]["false_regions_per_100m"] == 0
+
+
+def test_two_recordings_are_merged_by_tunnelcd_where_no_merge_is_given(simulated: Path, tmp_path: Path) -> None:
+    make_pair(graft(simulated / "before", simulated / "after"), SEED, tmp_path / "pair")
+    truth = read_pair_truth(tmp_path / "pair").graft
+    assert truth is not None
+    assert (truth["merge_from"], truth["split"]) == ("tunnelcd", "two recordings")
+    odom = [read_session(simulated / name).odom_T_sensor[0] for name in ("before", "after")]
+    world = [read_true_poses(simulated / name)[0] for name in ("before", "after")]
+    true = odom[0] @ invert(world[0]) @ world[1] @ invert(odom[1])
+    np.testing.assert_allclose(truth["before_T_after"], true, atol=0.05)
+
+
+def test_one_recording_named_twice_is_refused(simulated: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="one and the same recording: name it once"):
+        make_pair(graft(simulated / "before", simulated / "before"), SEED, tmp_path / "pair")
+    assert list(tmp_path.iterdir()) == []
+
+
+def write_scans(session: Path, folder: Path, command: Command) -> Path:
+    """Write a session as PCD files and read them back as recorded by somebody else."""
+    pytest.importorskip("pypcd4", reason="pip install 'tunnelcd[formats]'")
+    assert command("convert", session, folder, "-q")[0] == 0
+    return folder
+
+
+def test_bare_points_are_rays_to_the_millimetre(simulated: Path, tmp_path: Path, command: Command) -> None:
+    source = open_session(write_scans(simulated / "before", tmp_path / "scans", command))
+    session = as_session(source)
+    again = RecordedScans(session)
+    for index in (0, 3):
+        points, made = source.scan(index).points_sensor, again.scan(index).points_sensor
+        assert len(points) == len(made)
+        assert np.abs(points - made).max() < 6e-4
+        off = np.cross(points, made) / np.linalg.norm(points, axis=1, keepdims=True)
+        assert np.linalg.norm(off, axis=1).max() < 2e-5  # across the ray
+
+
+def test_props_are_cast_into_bare_points(simulated: Path, tmp_path: Path, command: Command) -> None:
+    scans = write_scans(simulated / "before", tmp_path / "scans", command)
+    make_pair(graft(scans, props=boxes(1), split="alternate"), SEED, tmp_path / "pair")
+    truth = read_pair_truth(tmp_path / "pair")
+    assert truth.changes[0].is_observable
+    assert truth.graft is not None
+    assert not any(truth.graft["noise"][0]["n_gaps"])
+    opened = open_session(tmp_path / "pair" / "before")
+    was = np.concatenate(
+        [transform(each.odom_T_sensor, each.points_sensor) for each in open_session(scans).scans()][::2]
+    )
+    now = np.concatenate([transform(each.odom_T_sensor, each.points_sensor) for each in opened.scans()])
+    np.testing.assert_allclose(now, was, atol=6e-4)  # nothing stands in the before session
+
+
+def test_every_public_recording_says_where_it_is_from(tmp_path: Path) -> None:
+    adapters = list_adapters()
+    assert {"conslam", "geode-metro", "hilti-2023", "min3d-underground", "ntnu-fog", "ntnu-tunnel", "subiaco"} <= set(
+        adapters
+    )
+    for name, adapter in adapters.items():
+        assert adapter.url.startswith("https://")
+        assert bool(adapter.sessions) != bool(adapter.unreadable)
+        if adapter.unreadable:
+            with pytest.raises(InputError, match=f"--recording {name}: .*{adapter.url}"):
+                locate_recording(name, tmp_path)
+            continue
+        with pytest.raises(InputError, match=f"--recording {name}: no .*: fetch and unpack .*licence"):
+            locate_recording(name, tmp_path)
+        for part in adapter.sessions:
+            (tmp_path / part).mkdir(exist_ok=True)
+        Recording.model_validate(locate_recording(name, tmp_path))
+
+
+def test_the_command_line(simulated: Path, tmp_path: Path, command: Command) -> None:
+    props = tmp_path / "props.yaml"
+    props.write_text("props:\n  - {name: box, kind: box, size_m: [0.8, 0.6, 0.7], change: added}\n")
+    told = ("--seed", SEED, "--reach", "4", "--clearance", "0.5", "--out")
+    code, out, _ = command("graft", simulated / "before", "--objects", props, *told, tmp_path / "pair")
+    assert code == 0
+    assert "every other revolution of one recording" in out
+    assert "1 changes, 1 observable" in out
+    assert command("score", tmp_path / "pair", tmp_path)[0] == 2  # there is no answer; the pair itself is read
+    code, out, _ = command("graft", simulated / "before", "--out", tmp_path / "null")
+    assert (code, "a real pair without changes" in out) == (0, True)
+    own = tmp_path / "own.yaml"
+    own.write_text(
+        f"recording: {{sessions: [{simulated / 'before'}], reach_m: 4, clearance_m: 0.5}}\n{props.read_text()}"
+    )
+    assert command("simulate", own, "--seed", SEED, "--out", tmp_path / "simulated", "-q")[0] == 0
+    read = [(tmp_path / name / "after" / "chunks" / "00000.npz").read_bytes() for name in ("pair", "simulated")]
+    assert read[0] == read[1]
+    assert command("view", own, "--html", tmp_path / "v.html")[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("argv", "told"),
+    [
+        ((), "0 recordings: expected one"),
+        (("{s}", "{s}", "{s}"), "3 recordings: expected one"),
+        (("{s}", "--objects", "no-such"), "no-such"),
+        (("{s}", "--split", "passes"), "no way is driven twice"),
+        (("{s}", "--odometry", "kiss-icp"), "a session has its own poses"),
+        (("{s}/nowhere",), "no such file"),
+        (("--recording", "conslm"), 'did you mean "conslam"'),
+        (("--recording", "conslam"), "give --root DIR"),
+    ],
+)
+def test_what_cannot_be_grafted_is_one_line(
+    argv: tuple[str, ...], told: str, simulated: Path, tmp_path: Path, command: Command
+) -> None:
+    words = [word.replace("{s}", str(simulated / "before")) for word in argv]
+    code, _, err = command("graft", *words, "--out", tmp_path / "pair", "-q")
+    assert code == 2
+    assert told in err
+    assert "Traceback" not in err
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,119 @@
+"""Rows and answers at a URL: the local and the memory file system."""
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from fsspec.implementations.memory import MemoryFileSystem
+
+from cdpipe.core.errors import InputError
+from eval.plans.plan import Plan
+from eval.running.runfolder import RunFolder
+from eval.running.scaling.mirror import Mirror
+from eval.running.scaling.shards import Shard
+from tests.eval.running.scaling.conftest import Runner
+from tests.same_numbers import differences
+
+Command = Callable[..., tuple[int, str, str]]
+PART = Shard(1, 3)
+
+
+@pytest.fixture(name="url", params=["memory", "file", "folder"])
+def url_fixture(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
+    yield {"memory": "memory://bucket/run", "file": f"file://{tmp_path}/far", "folder": str(tmp_path / "far")}[
+        request.param
+    ]
+    MemoryFileSystem.store.clear()
+    MemoryFileSystem.pseudo_dirs[:] = [""]
+
+
+def test_rows_and_answers_are_copied_and_a_new_folder_goes_on(
+    tmp_path: Path, runner: Runner, plan: Plan, shards: list[Path], url: str
+) -> None:
+    runner.run(tmp_path / "a", plan, shard=PART, limit=3, mirror=Mirror(url))
+    shutil.rmtree(tmp_path / "a")  # the scratch disk of a machine that is gone
+    run, outcome = runner.run(tmp_path / "b", plan, shard=PART, mirror=Mirror(url), keep="answers")
+    assert (outcome.n_done, outcome.n_kept) == (1, 3)
+    Mirror(url).fetch_all(tmp_path / "c")
+    for table in ("results", "regions"):
+        shutil.copyfile(run.path / f"{table}.csv", tmp_path / "c" / f"{table}.csv")
+    for table in ("changes", "objects", "keyframes"):
+        shutil.copyfile(run.path / f"{table}.csv", tmp_path / "c" / f"{table}.csv")
+    assert list(differences(tmp_path / "c", shards[0])) == []
+    assert Mirror(url).provenance() == run.provenance()
+
+
+def test_forced_cells_are_forgotten_there_first(tmp_path: Path, runner: Runner, plan: Plan) -> None:
+    url = f"file://{tmp_path}/far"
+    runner.run(tmp_path / "a", plan, shard=PART, mirror=Mirror(url))
+    with pytest.raises(KeyboardInterrupt):
+        runner.run(tmp_path / "a", plan, shard=PART, mirror=Stopped(url), force=True)
+    _, outcome = runner.run(tmp_path / "b", plan, shard=PART, mirror=Mirror(url))
+    assert outcome.n_done == 4
+
+
+class Stopped(Mirror):
+    def copy_pair(self, *_: object) -> None:
+        raise KeyboardInterrupt
+
+
+def test_merge_runs_takes_urls(
+    tmp_path: Path, runner: Runner, plan: Plan, shards: list[Path], whole: Path, command: Command
+) -> None:
+    runner.run(tmp_path / "a", plan, shard=PART, mirror=Mirror(f"file://{tmp_path}/far"))
+    code, _, err = command("merge-runs", f"file://{tmp_path}/far", *shards[1:], "--out", tmp_path / "run", "--quiet")
+    assert (code, err) == (0, "")
+    assert list(differences(tmp_path / "run", whole)) == []
+    assert RunFolder(tmp_path / "run").provenance()["parts"][0]["folder"] == f"file://{tmp_path}/far"
+
+
+def test_a_copy_of_another_shard_or_of_something_else_is_refused(tmp_path: Path, runner: Runner, plan: Plan) -> None:
+    url = f"file://{tmp_path}/far"
+    runner.run(tmp_path / "a", plan, shard=PART, mirror=Mirror(url))
+    with pytest.raises(InputError, match=f"^{url}: holds shard 1/3, this is shard 2/3"):
+        runner.run(tmp_path / "b", plan, shard=Shard(2, 3), mirror=Mirror(url))
+    place = Mirror(url)
+    place._fs.rm_file(place._place("provenance.json"))
+    with pytest.raises(InputError, match=f"^{url}: not empty and not a copy of a run: name another place"):
+        runner.run(tmp_path / "c", plan, shard=PART, mirror=Mirror(url))
+    with pytest.raises(InputError, match="not empty and not a copy of a run"):
+        place.fetch_all(tmp_path / "d")
+
+
+@pytest.mark.parametrize("name", ["cells/../../x.json", "cells/a/b/c.json", "cells/a/1/.c.json", "cells/a/1/2/c.json"])
+def test_files_with_other_names_are_left_there(tmp_path: Path, runner: Runner, plan: Plan, name: str) -> None:
+    place = Mirror("memory://odd")
+    place._fs.pipe_file("/odd/provenance.json", b'{"tool": "tunnelcd"}')
+    place._fs.store[f"/odd/{name}"] = place._fs.store["/odd/provenance.json"]
+    place.fetch_all(tmp_path / "run" / "in")
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["provenance.json"]
+    MemoryFileSystem.store.clear()
+
+
+def test_a_cell_that_is_too_large_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = Mirror("memory://large")
+    place._fs.pipe_file("/large/provenance.json", b'{"tool": "tunnelcd"}')
+    place._fs.pipe_file("/large/cells/a/1/b.json", b"{" + b" " * 100)
+    monkeypatch.setattr("eval.running.scaling.mirror.MAX_BYTES", 50)
+    with pytest.raises(InputError, match="101 bytes, more than the 50 that it may have"):
+        place.fetch_all(tmp_path / "run")
+    MemoryFileSystem.store.clear()
+
+
+@pytest.mark.parametrize(
+    ("url", "what"),
+    [
+        ("nosuch://x/y", "nosuch://x/y"),
+        ("ftp://me:secret@host/run", "a URL with a password would stand in provenance.json"),
+    ],
+)
+def test_a_place_that_cannot_be_opened_is_one_line(tmp_path: Path, command: Command, url: str, what: str) -> None:
+    code, _, err = command("run", "smoke", "--out", tmp_path / "run", "--rows-to", url)
+    assert code == 2 and err.startswith(f"error: {what}") and err.count("\n") == 1 and "secret" not in err
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_run_folder_is_no_copy_of_itself(tmp_path: Path, command: Command) -> None:
+    code, _, err = command("run", "smoke", "--out", tmp_path / "run", "--rows-to", f"file://{tmp_path}/run")
+    assert (code, err) == (2, f"error: --rows-to file://{tmp_path}/run: is the run folder itself: name another place\n")

@@ -1,0 +1,107 @@
+"""Scenarios whose world is a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from pydantic import TypeAdapter
+
+from cdpipe.core.errors import ScenarioError
+from eval.running.pair_run import Pair
+from scenarios.grafted import GraftScenario
+from scenarios.library import check_scenario, load_grafted, load_scenario
+from scenarios.references import file_digests
+from scenarios.schema import Place
+
+BOX = "{name: box, kind: box, size_m: [{uniform: [0.6, 0.9]}, 0.6, 0.7], change: added}"
+
+
+def write(folder: Path, text: str) -> str:
+    (folder / "drive.osf").write_bytes(b"one")
+    (folder / "real.yaml").write_text(text)
+    return str(folder / "real.yaml")
+
+
+def test_a_file_with_a_recording_is_drawn_like_any_other(tmp_path: Path) -> None:
+    path = write(tmp_path, f"recording: {{sessions: [drive.osf]}}\nprops:\n  - {BOX}\n")
+    drawn = load_scenario(path, 3)
+    assert isinstance(drawn, GraftScenario)
+    assert drawn.recording.sessions == (str(tmp_path / "drive.osf"),)
+    assert drawn.props[0].size_m != load_scenario(path, 4).props[0].size_m
+    assert drawn.props[0].size_m == load_scenario(path, 3).props[0].size_m
+    dumped = drawn.model_dump(mode="json")
+    assert set(dumped) == {"family", "description", "score_radius_m", "props", "recording"}
+    assert GraftScenario.model_validate(dumped) == drawn
+    assert isinstance(check_scenario(path), GraftScenario)
+
+
+def test_a_task_of_a_plan_keeps_the_recording(tmp_path: Path) -> None:
+    drawn = load_scenario(write(tmp_path, f"recording: {{sessions: [drive.osf]}}\nprops: [{BOX}]\n"), 3)
+    adapter = TypeAdapter(Pair)
+    for scenario in (drawn, load_scenario("smoke/one_box", 3)):
+        pair = Pair("real", "real", "", 3, scenario, {}, "", ())
+        assert adapter.validate_json(adapter.dump_json(pair)).scenario == scenario
+
+
+def test_the_digest_of_a_recording_is_that_of_its_content(tmp_path: Path) -> None:
+    drawn = load_scenario(write(tmp_path, "recording: {sessions: [drive.osf]}\n"), 3)
+    first = file_digests(drawn)
+    (tmp_path / "drive.osf").write_bytes(b"two")
+    assert file_digests(drawn) != first
+    (tmp_path / "drive.osf").unlink()
+    (tmp_path / "drive.osf" / "truth").mkdir(parents=True)
+    (tmp_path / "drive.osf" / "a").write_text("1")
+    folder = file_digests(drawn)
+    (tmp_path / "drive.osf" / "truth" / "b").write_text("the truth is no part of a recording")
+    assert file_digests(drawn) == folder
+    (tmp_path / "drive.osf" / "a").write_text("2")
+    assert file_digests(drawn) != folder
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("recording: {sessions: [nowhere]}", r"recording.sessions.0 = 'nowhere': no such file: expected .*nowhere"),
+        ("recording: {sessions: []}", "recording.sessions"),
+        ("recording: {sessions: [drive.osf], splt: halves}", 'did you mean "split"'),
+        ("recording: {sessions: [drive.osf], before_T_after: drive.osf}", "in one frame: leave it out"),
+        ("recording: {sessions: [drive.osf, drive.osf], split: halves}", "two recordings are not split"),
+        (
+            "recording: {sessions: [drive.osf], trajectories: [drive.osf, drive.osf]}",
+            "one for each of the 1 recordings",
+        ),
+        ("recording: {sessions: [drive.osf], odometry: kiss-icp, trajectories: [drive.osf]}", "both give the poses"),
+        ("recording: {sessions: [drive.osf], reach_m: 0.5}", "expected more than clearance_m"),
+        ("recording: {sessions: [drive.osf]}\nsensor: {mode: 512x10}", "the recording has its own: leave sensor out"),
+        (
+            "recording: {sessions: [drive.osf]}\n"
+            "props: [{name: a, kind: box, size_m: [1, 1, 1], place: {posture: tipped}}]",
+            "props are grafted upright",
+        ),
+        (
+            "recording: {sessions: [drive.osf]}\nprops: [{name: a, kind: box, size_m: [1, 1, 1], place: {area: b}}]",
+            "there are no areas",
+        ),
+    ],
+)
+def test_mistakes_are_told(tmp_path: Path, text: str, told: str) -> None:
+    with pytest.raises(ScenarioError, match=told):
+        load_scenario(write(tmp_path, text), 3)
+
+
+def test_of_a_scenario_with_a_tunnel_the_props_count_alone(tmp_path: Path) -> None:
+    (tmp_path / "drive").mkdir()
+    recording = {"sessions": [str(tmp_path / "drive")]}
+    drawn, whole = load_grafted("narrow", recording, 5), load_scenario("narrow", 5)
+    assert [prop.name for prop in drawn.props] == [prop.name for prop in whole.props]
+    assert [prop.size_m for prop in drawn.props] == [prop.size_m for prop in whole.props]
+    assert all(prop.place == Place(yaw_deg=prop.place.yaw_deg) for prop in drawn.props)
+    assert load_grafted("none", recording, 5).props == ()
+    assert all(prop.change == "none" for prop in load_grafted("unchanged/narrow", recording, 5).props)
+
+
+def test_a_file_with_a_recording_gives_no_props_to_another(tmp_path: Path) -> None:
+    path = write(tmp_path, "recording: {sessions: [drive.osf]}\n")
+    with pytest.raises(ScenarioError, match=r"real.yaml:1: recording: the file names its own"):
+        load_grafted(path, {"sessions": [path]}, 3)
