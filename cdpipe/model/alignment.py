@@ -7,6 +7,8 @@ on the position.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -26,9 +28,18 @@ _MIN_POINTS_PER_CELL = 3
 _BLOCK_POINTS = 1 << 12
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+class _Anchors(NamedTuple):
+    """k-d tree of the (A, 3) anchors in one frame, and the (A, 4, 4) poses of that frame in the other."""
+
+    tree: cKDTree
+    dst_T_src: Float64Array
+
+
+@dataclass(frozen=True, eq=False)
 class PathAlignment:
     """A transform for each of some anchors along the path, blended between them.
+
+    The trees of the anchors are made once: a crop moves a single point, and a long path has ten thousand anchors.
 
     Attributes:
         anchors_odom: (A, 3) positions, after odom frame, metres.
@@ -62,7 +73,7 @@ class PathAlignment:
         require_shape("positions_odom", positions_odom, (None, 3))
         if self.is_rigid:
             return np.repeat(self.before_T_after, len(positions_odom), axis=0)
-        nearest, weights = _weights(self.anchors_odom, positions_odom)
+        nearest, weights = _weights(self._of_odom.tree, positions_odom)
         poses = np.einsum("nk,nkij->nij", weights, self.before_T_after[nearest])
         moved = np.einsum("nij,nj->ni", poses[:, :3, :3], positions_odom) + poses[:, :3, 3]
         # the mean of rotations a degree apart is nearly a rotation; the SVD projects it onto one
@@ -75,29 +86,37 @@ class PathAlignment:
 
     def to_map(self, points_odom: Float64Array) -> Float64Array:
         """Return (N, 3) points of the after odom frame in the map frame."""
-        return _move(points_odom, self.anchors_odom, self.before_T_after)
+        return _move(points_odom, self._of_odom)
 
     def to_odom(self, points_map: Float64Array) -> Float64Array:
         """Return (N, 3) points of the map frame in the after odom frame.
 
         The inverse of `to_map` up to millimetres, the bend of the blend between two anchors.
         """
+        return _move(points_map, self._of_map)
+
+    @cached_property
+    def _of_odom(self) -> _Anchors:
+        return _Anchors(cKDTree(self.anchors_odom), self.before_T_after)
+
+    @cached_property
+    def _of_map(self) -> _Anchors:
         rotated = np.einsum("aij,aj->ai", self.before_T_after[:, :3, :3], self.anchors_odom)
-        return _move(points_map, rotated + self.before_T_after[:, :3, 3], invert(self.before_T_after))
+        return _Anchors(cKDTree(rotated + self.before_T_after[:, :3, 3]), invert(self.before_T_after))
 
 
-def _move(points: Float64Array, anchors: Float64Array, dst_T_src: Float64Array) -> Float64Array:
+def _move(points: Float64Array, anchors: _Anchors) -> Float64Array:
     """Move points by interpolating the blend between the corners of their cells; exactly where that is no slower."""
     require_shape("points", points, (None, 3))
-    if len(anchors) == 1:
-        return transform(dst_T_src[0], points)
+    if len(anchors.dst_T_src) == 1:
+        return transform(anchors.dst_T_src[0], points)
     cells, first, cell_of = np.unique(cell_keys(points, _CELL_M), return_index=True, return_inverse=True)
     if len(points) <= _MIN_POINTS_PER_CELL * len(cells):
-        return _blend(points, anchors, dst_T_src)
+        return _blend(points, anchors)
     low = np.floor(points[first] / _CELL_M)
     around = (low[:, None] + _CORNERS).reshape(-1, 3) * _CELL_M
     _, first, corner_of = np.unique(cell_keys(around, _CELL_M), return_index=True, return_inverse=True)
-    corners = _blend(around[first], anchors, dst_T_src)
+    corners = _blend(around[first], anchors)
     corners_of_cell = corners[corner_of].reshape(len(cells), 3 * len(_CORNERS))
     return np.concatenate(
         [
@@ -116,19 +135,19 @@ def _between_corners(points: Float64Array, low: Float64Array, corners: Float64Ar
     return np.asarray(np.einsum("nk,nkj->nj", weights.reshape(-1, 8), corners.reshape(-1, 8, 3)))
 
 
-def _blend(points: Float64Array, anchors: Float64Array, dst_T_src: Float64Array) -> Float64Array:
+def _blend(points: Float64Array, anchors: _Anchors) -> Float64Array:
     moved = np.zeros_like(points)
-    nearest, weights = _weights(anchors, points)
+    nearest, weights = _weights(anchors.tree, points)
     for k in range(nearest.shape[1]):
-        chosen = dst_T_src[nearest[:, k]]
+        chosen = anchors.dst_T_src[nearest[:, k]]
         moved += weights[:, k, None] * (np.einsum("nij,nj->ni", chosen[:, :3, :3], points) + chosen[:, :3, 3])
     return moved
 
 
-def _weights(anchors: Float64Array, positions: Float64Array) -> tuple[Int64Array, Float64Array]:
+def _weights(anchors: cKDTree, positions: Float64Array) -> tuple[Int64Array, Float64Array]:
     """Return the nearest anchors (N, k) of each position and their weights, which add up to 1."""
-    n_blended = min(_BLENDED, len(anchors))
-    found = cKDTree(anchors).query(positions, k=[*range(1, n_blended + 1)])
+    n_blended = min(_BLENDED, anchors.n)
+    found = anchors.query(positions, k=[*range(1, n_blended + 1)])
     distances_m, nearest = np.asarray(found[0]), np.asarray(found[1], dtype=np.int64)
     # against the nearest one, so that far from the path the weights do not all vanish
     weights = np.exp((distances_m[:, :1] ** 2 - distances_m**2) / (2 * _BLEND_M**2))

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -18,30 +18,102 @@ def bench(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE.json", help="also write the table", show_default=False)
     ] = None,
-    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="this row only; may be repeated")] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="this row, axis or scenario only; may be repeated")
+    ] = None,
+    growth: Annotated[
+        bool, typer.Option("--growth", help="how time and memory grow with the input; also FILE.csv and FILE.png")
+    ] = False,
+    profile: Annotated[
+        bool, typer.Option("--profile", help="where the time of both paper sites goes, by stage; also FILE.md")
+    ] = False,
+    surface: Annotated[
+        bool, typer.Option("--surface", help="with --profile: displacement of the rock as well")
+    ] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="with --growth: sizes that show only that it runs")] = False,
+    large: Annotated[bool, typer.Option("--large", help="with --growth: up to 5 million points")] = False,
+    as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Measure the speed table, each figure beside its rival in the same run. A missed target is not an error."""
-    import pandas as pd
-
-    from eval.bench.bench import choose, list_contests, list_reasons, measure, require_writable, summarise, write_table
+    from eval.bench.bench import choose, list_contests, measure, require_writable
+    from eval.bench.growth import choose_axes, measure_growth, write_growth
+    from eval.bench.profile import SITES, measure_profile, write_markdown
     from eval.core.progress import Lines, Silent
 
-    rows = choose(list_contests(), only or ())
+    _require_one_table(growth=growth, profile=profile, surface=surface, quick=quick, large=large)
     if out is not None:
         require_writable(out)
     # lines, never bars: the time of a thread that redraws bars would be measured as well
-    table = measure(rows, (Silent() if quiet else Lines()).cells)
-    if out is not None:
-        write_table(table, out)
-    if quiet:
-        return
+    tell = (Silent() if quiet else Lines()).cells
+    written: list[Path] = []
+    if growth:
+        table = measure_growth(choose_axes(only or ()), quick=quick, large=large, on_progress=tell)
+        written = [] if out is None else write_growth(table, out)
+    elif profile:
+        table = measure_profile(only or SITES, has_surface=surface, on_progress=tell)
+        written = [] if out is None else [write_markdown(table, out)]
+    else:
+        table = measure(choose(list_contests(), only or ()), tell)
+    written = [*([] if out is None else [out]), *written]
+    tell_json(table, as_json=as_json, file=out)
+    show = _print_growth if growth else _print_profile if profile else _print_speed
+    if not quiet and not as_json:
+        show(table, written)
+
+
+def _require_one_table(*, growth: bool, profile: bool, surface: bool, quick: bool, large: bool) -> None:
+    """Refuse options of a table that is not asked for.
+
+    Raises:
+        InputError: Which one.
+    """
+    from cdpipe.core.errors import InputError
+
+    if growth and profile:
+        raise InputError("--growth and --profile: two tables: ask for one at a time")
+    if quick and large:
+        raise InputError("--quick and --large: name one of both")
+    for is_given, name, needed, needs in ((quick, "quick", growth, "growth"), (large, "large", growth, "growth"),
+                                          (surface, "surface", profile, "profile")):  # fmt: skip
+        if is_given and not needed:
+            raise InputError(f"--{name}: belongs to --{needs}: add it, or leave --{name} out")
+
+
+def _print_speed(table: dict[str, Any], written: list[Path]) -> None:
+    import pandas as pd
+
+    from eval.bench.bench import list_reasons, summarise
+
     shown = pd.DataFrame(table["rows"]).assign(met=[MET[row["met"]] for row in table["rows"]]).drop(columns="reason")
-    cpu, cores = table["machine"]["cpu"], table["machine"]["cores"]
-    print_table(f"speed, {cpu}, {cores} cores; ratio: times faster than the rival", shown)
-    for line in list_reasons(table["rows"]):
-        echo(line)
-    echo(f"{summarise(table['rows'])}{'' if out is None else f'; {out}'}")
+    print_table(f"speed, {_machine(table)}; ratio: times faster than the rival", shown)
+    echo(*list_reasons(table["rows"]), _with_files(summarise(table["rows"]), written))
+
+
+def _print_growth(table: dict[str, Any], written: list[Path]) -> None:
+    import pandas as pd
+
+    from eval.bench.growth import summarise_growth
+
+    shown = pd.DataFrame(table["rows"]).drop(columns=["axis", "n"])
+    print_table(f"growth, {_machine(table)}; figure = c * size ** exponent; low, high: 95 %; last: last step", shown)
+    echo(_with_files(summarise_growth(table), written))
+
+
+def _print_profile(table: dict[str, Any], written: list[Path]) -> None:
+    import pandas as pd
+
+    print_table(f"profile, {_machine(table)}; share: of the command's CPU time", pd.DataFrame(table["rows"]))
+    if written:
+        echo(_with_files("written", written))
+
+
+def _machine(table: dict[str, Any]) -> str:
+    return f"{table['machine']['cpu']}, {table['machine']['cores']} cores"
+
+
+def _with_files(told: str, written: list[Path]) -> str:
+    return "; ".join([told, *map(str, written)])
 
 
 def list_command(

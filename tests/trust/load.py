@@ -30,7 +30,8 @@ import cdpipe
 from cdpipe.core.geometry import make_pose, stream, yaw_pose
 from cdpipe.io.answer import Answer
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
-from cdpipe.pipeline import Done, Hooks
+from eval.bench.corridor import CorridorScans
+from eval.bench.meter import StageMeter, peak_mb
 from eval.plans.plan import expand_cells, load_plan
 from eval.plans.worlds import list_worlds
 from eval.running.pair_run import CellKeys
@@ -42,7 +43,6 @@ from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from sim.session.truth import PairTruth
 from tests.eval.changes import change
-from tests.trust.corridor import CorridorScans
 
 MAPS_GB, SCORE_S, PLAN_S, PAGE_MB, CELLS_GB = 8.0, 60.0, 60.0, 30.0, 8.0
 # A plan of so many cells may take `PLAN_S`, a larger one as much more.
@@ -66,41 +66,18 @@ class Row(NamedTuple):
     is_within: bool = True
 
 
-class _Meter(Hooks):
-    """Measures the peak memory and the time of each stage of `detect`."""
-
-    def __init__(self) -> None:
-        super().__init__(self._start)
-        self.rows: list[tuple[str, float, float]] = []
-        self._begun: tuple[str, float] | None = None
-
-    def _start(self, name: str, done: int = 0, total: int = 0) -> None:
-        self.stop()
-        Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
-        self._begun = name, time.monotonic()
-
-    def stop(self) -> None:
-        if self._begun is not None:
-            self.rows.append((self._begun[0], _peak_gb(), time.monotonic() - self._begun[1]))
-        self._begun = None
-
-    def time(self, compute: Any) -> Done[Any]:
-        self._start("extract")
-        return super().time(compute)
-
-
 def measure_maps(km: float) -> list[Row]:
     """Detect changes between two drives of some kilometres."""
     places = np.arange(_HEAPS_M / 2, 1000 * km, _HEAPS_M)
     before = CorridorScans(1000 * km, _RADIUS_M, _SPACING_M, places[::2].tolist(), seed=1)
     pose = yaw_pose(0.7, (30.0, -20.0, 1.0))
     after = CorridorScans(1000 * km, _RADIUS_M, _SPACING_M, places[1::2].tolist(), seed=2, odom_T_world=pose)
-    meter = _Meter()
+    meter = StageMeter()
     report = cdpipe.detect(before, after, hooks=meter, settings=["query.threshold=-20"])
-    meter.stop()
+    meter.start("")
     n_points = [report.evidence[f"map_points_{name}"] / 1e6 for name in ("before", "after")]
     size = f"{km:g} km, {n_points[0]:.1f} + {n_points[1]:.1f} million map points"
-    stages = [Row(f"detect: {name}", "", peak_gb, seconds) for name, peak_gb, seconds in meter.rows]
+    stages = [Row(f"detect: {name}", "", cost.peak_mb / 1e3, cost.wall_s) for name, cost in meter.costs.items()]
     peak_gb, seconds = max(row.peak_gb for row in stages), sum(row.seconds for row in stages)
     return [*stages, Row("detect", size, peak_gb, seconds, f"{MAPS_GB:g} GB", peak_gb <= MAPS_GB)]
 
@@ -120,7 +97,7 @@ def measure_changes(n: int) -> list[Row]:
     seconds = time.monotonic() - start
     assert row["object_iou_point"] == row["region_recall"] == 1.0
     size = f"{n} changes, objects and regions"
-    return [Row("score", size, _peak_gb(), seconds, f"{SCORE_S:g} s", seconds <= SCORE_S)]
+    return [Row("score", size, peak_mb() / 1e3, seconds, f"{SCORE_S:g} s", seconds <= SCORE_S)]
 
 
 def measure_cells(n: int, n_keyframes: int = 150, place: str | None = None) -> list[Row]:
@@ -143,11 +120,6 @@ def measure_cells(n: int, n_keyframes: int = 150, place: str | None = None) -> l
         Row("run and report", f"{n} cells", peak_gb, seconds, f"{limit_s:g} s", seconds <= limit_s),
         Row("run and report", f"{n} cells", peak_gb, seconds, f"{CELLS_GB:g} GB", peak_gb <= CELLS_GB),
     ]
-
-
-def _peak_gb() -> float:
-    status = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in status if line.startswith("VmHWM")) / 1e6
 
 
 def _crowded_truth(n: int) -> GroundTruth:

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from cdpipe.core.spooled import SpooledArray
 from cdpipe.mapping import mapping
 from cdpipe.model.config import MapConfig
-from tests.trust.corridor import CorridorScans
+from eval.bench.corridor import CorridorScans
 
 MOST_BYTES_PER_POINT = 250
 FEW_SCANS = 2

@@ -109,7 +109,8 @@ def _centreline(way_m: Float64Array) -> tuple[Float64Array, Float64Array]:
 def _relief(length_m: float) -> Float64Array:
     """Return the relief of the wall at nodes along and around the tunnel, metres."""
     rng = stream(0, "corridor")
-    along = 2 * np.pi / np.exp(rng.uniform(*np.log(_WAVES_M), _N_WAVES))
+    shortest, longest = np.log(_WAVES_M).tolist()
+    along = 2 * np.pi / np.exp(rng.uniform(shortest, longest, _N_WAVES))
     around = rng.integers(0, 8, _N_WAVES)
     phase = rng.uniform(0.0, 2 * np.pi, _N_WAVES)
     at_way = np.exp(1j * (np.outer(np.arange(0.0, length_m + _NODE_M, _NODE_M), along) + phase))
