@@ -145,7 +145,10 @@ class _Reader(HTMLParser):
         self._section, self._heading, self._address = "", "", ""
         self._texts: dict[str, str] = {}
         self._part = ""
-        self._group, self._rows, self._cells = "", [], []  # type: ignore[var-annotated]
+        self._group = ""
+        self._rows: list[tuple[str, tuple[Cell, ...]]] = []
+        self._opened = ("", False, False)  # tag of a cell, whether it is a best one, whether it heads a group
+        self._cells: list[tuple[str, bool, Cell]] = []
         self._headings: tuple[str, ...] = ()
         self._depth_of_summary = 0
 
@@ -163,7 +166,7 @@ class _Reader(HTMLParser):
         elif tag == "tr":
             self._cells = []
         elif tag in ("td", "th"):
-            self._cells.append((tag, "best" in classes, "group" in classes))
+            self._opened = tag, "best" in classes, "group" in classes
             self._part, self._texts["cell"], self._texts["interval"] = "cell", "", ""
         elif tag == "small" or "interval" in classes:
             self._part = "interval"
@@ -189,8 +192,8 @@ class _Reader(HTMLParser):
             self._part = ""
 
     def _end_cell(self) -> None:
-        kind, is_best, is_group = self._cells[-1]
-        self._cells[-1] = (kind, is_group, Cell(self._texts["cell"], is_best, self._texts["interval"]))
+        kind, is_best, is_group = self._opened
+        self._cells.append((kind, is_group, Cell(self._texts["cell"], is_best, self._texts["interval"])))
 
     def _end_row(self) -> None:
         cells = [cell for _, _, cell in self._cells]
