@@ -5,8 +5,7 @@
 3. At each place the offset between both surfaces is measured along the normal (`offsets`).
 4. The rigid motions that most of the offsets share are the alignment's (`motions`). They are taken off the scans of the
    after session, place by place of the sensor, and the offsets are measured again.
-5. The level of detection adds up the error of the means, the covariance of those motions, and the roughness. Where
-   neighbours scatter more than that, it is enlarged (`scatter`).
+5. The level of detection adds up the error of the means, the covariance of those motions, and the roughness.
 6. Objects are told from rock (`rock_or_object`), and the displacement of objects is left out.
 7. Neighbouring places beyond their level are regions (`regions`). Hollows have a hidden bottom (`hollows`).
 """
@@ -37,7 +36,6 @@ from cdpipe.surface.rivals.c2m import measure_c2m
 from cdpipe.surface.rivals.m3c2 import measure_m3c2, measure_m3c2_ep
 from cdpipe.surface.rivals.unrolled import measure_unrolled
 from cdpipe.surface.rock_or_object import split_rock
-from cdpipe.surface.scatter import excess_scatter
 from cdpipe.surface.unrolled import unroll
 
 # Rougher or less flat places (edges, pipes, bolts) do not tell the motion of the alignment.
@@ -56,8 +54,6 @@ _TILT_RAD, _CLOSE_M = 2e-3, 4.0
 _NEIGHBOURS = 8
 # Share of the roughness that both spheres do not share, as standard deviation, and the least error of a mean.
 _ROUGHNESS, _LEAST_M = 0.18, 0.0004
-# Share of the scatter beyond the levels that neighbours share.
-_SHARED_SCATTER = 0.3
 
 
 def measure_surface(
@@ -109,12 +105,8 @@ def measure_planes(
     rough_m2 = (_ROUGHNESS * places.roughness_m) ** 2
     tilt_m2 = (_TILT_RAD * np.maximum(places.seen_from_m - _CLOSE_M, 0.0)) ** 2
     shared_m2 = alignment_m2 + tilt_m2
-    own_m2 = noise_m2 + rough_m2 + shared_m2 + _LEAST_M**2
-    along_m = found.along_m - explained_m
-    excess = excess_scatter(places.points, along_m, Z95 * np.sqrt(own_m2)) ** 2
-    shared_m2 += _SHARED_SCATTER * (excess - 1) * own_m2
-    level_m, shared_m = (Z95 * np.sqrt(each) for each in (excess * own_m2, shared_m2))
-    return Measured(found.nearest_m - explained_m, along_m, level_m, shared_m, laid)
+    level_m, shared_m = (Z95 * np.sqrt(each) for each in (noise_m2 + rough_m2 + shared_m2 + _LEAST_M**2, shared_m2))
+    return Measured(found.nearest_m - explained_m, found.along_m - explained_m, level_m, shared_m, laid)
 
 
 def _trust(places: SurfacePlaces, found: Offsets) -> Float64Array:
