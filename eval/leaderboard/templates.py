@@ -13,7 +13,7 @@ _PAGES = {"own": ("scoring", "ANSWERS.md", ""), "given": ("leaderboard", "EVALUA
 
 
 def read_template(merge: Literal["own", "given"]) -> str:
-    """Return a whole method that `evaluate` can call: one that merges by the package, or one that is given the merge."""
+    """Return a whole method that `evaluate` can call: it merges by the package, or is given the merge."""
     folder, page, title = _PAGES[merge]
     text = (resources.files("eval") / folder / page).read_text(encoding="utf-8")
     found = re.search(rf"^```python{title}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
