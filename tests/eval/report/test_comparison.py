@@ -86,7 +86,7 @@ def test_the_command_writes_table_and_page(runs: tuple[Path, Path], tmp_path: Pa
     table = pd.read_csv(b / "comparison.csv")
     assert tuple(table) == COLUMNS
     page = (b / "comparison.html").read_text()
-    assert "solid<b>" not in page
+    assert "solid<b>" not in page and "Filter rows" in page
     assert "solid&lt;b&gt;" in page
     for word in set(re.findall(r'(?:src|href)="([^"]*)"', page)):
         assert word.startswith(("data:", "#"))
