@@ -23,6 +23,7 @@ ABSENT = "absent"
 # Optional dependency of pyproject.toml -> the module that it installs.
 _EXTRAS = {
     "m3c2": "py4dgeo", "dufomap": "dufomap", "octomap": "pyoctomap", "kiss": "kiss_matcher", "odometry": "kiss_icp",
+    "genz": "genz_icp",
     "ouster": "ouster", "formats": "pypcd4", "rerun": "rerun",
 }  # fmt: skip
 
