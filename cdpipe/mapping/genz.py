@@ -53,7 +53,7 @@ def stored_scan(folder: Path, number: int) -> Path:
 
 
 def _keep_to_one_core() -> None:
-    """Let this process run on one core: the package adds up in the order of its threads, of which it takes no number."""
+    """Let this process run on one core: the package adds up in the order of its threads, whose number is not ours."""
     if sys.platform == "linux":
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, {cores[os.getpid() % len(cores)]})
