@@ -127,7 +127,7 @@ def _fit_scans(
     """Return the motions of the after scans, by path position of the sensor, that lay their returns on still places."""
     some = np.arange(0, len(places.points), _EVERY)
     places = places.take(some)
-    found = measure_offsets(before, make_cells(after), places, settings.radius_m, with_variance=False)
+    found = measure_offsets(before, make_cells(after, with_folds=False), places, settings.radius_m, with_variance=False)
     told_m = _trust(places, found)
     motions = fit_motions(places.points, places.normals, told_m, chainage_m[some], settings.window_m)
     is_still = _is_still(told_m - motions.along(places.points, places.normals, chainage_m[some])[0])

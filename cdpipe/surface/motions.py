@@ -49,13 +49,22 @@ class PathMotions:
 
     def shifts(self, points: Float64Array, path_m: Float64Array) -> Float64Array:
         """Return the (N, 3) displacement of (N, 3) points, each by the motion at its (N,) path position."""
-        shifts = np.zeros((len(points), 3))
-        for station, share in self._around(path_m):
-            turn, slide = self.motions[station, :3], self.motions[station, 3:]
-            (a, b, c), (x, y, z) = turn.T, (points - self.centres[station]).T
-            turned = np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=1)
-            shifts += share[:, None] * (turned + slide)
+        shifts = np.empty((len(points), 3))
+        (station, _), (following, share) = self._around(path_m)
+        for number in np.unique(station):
+            own = np.flatnonzero(station == number)
+            other = following[own[0]]
+            offsets = points[own] - self.centres[number]
+            turn, slide = self._linear(number, self.centres[number])
+            next_turn, next_slide = self._linear(other, self.centres[number])
+            further = offsets @ (next_turn - turn) + (next_slide - slide)
+            shifts[own] = offsets @ turn + slide + share[own, None] * further
         return shifts
+
+    def _linear(self, station: int, origin: Float64Array) -> tuple[Float64Array, Float64Array]:
+        """Return the (3, 3) matrix and the (3,) shift of a motion: of offsets from an origin, as rows."""
+        turn, slide = self.motions[station, :3], self.motions[station, 3:]
+        return np.cross(turn, np.eye(3)), slide + np.cross(turn, origin - self.centres[station])
 
     def along(
         self, points: Float64Array, normals: Float64Array, path_m: Float64Array
