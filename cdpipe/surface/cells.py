@@ -34,6 +34,8 @@ _REACH_M = 16.0
 _LEAST_RETURNS, _THINNED = 2, 0.05
 # At most so many scans are averaged at once, and so many points moved.
 _SCANS, _BLOCK = 16, 1 << 18
+# So many stretches are averaged before their means are put together.
+_STRETCHES = 64
 _NONE = np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int64)
 
 
@@ -87,9 +89,16 @@ def near_returns(merged: MergedMaps, session: SessionName) -> NearReturns:
     poses = point_map.odom_T_sensor
     path_m = travelled_m(poses)
     map_T_odom = None if session == "before" else merged.alignment.at(poses[:, :3, 3])
-    parts = in_threads(partial(_average_stretch, point_map, map_T_odom, path_m), _stretches(path_m))
-    points, paths_m, weights, counts, keys = (np.concatenate(each) for each in zip(_NONE, *parts, strict=True))
-    del parts
+    average = partial(_average_stretch, point_map, map_T_odom, path_m)
+    stretches, n_returns, n = _stretches(path_m), int(point_map.scan_offsets[-1]), 0
+    # there are no more means than returns; what is not written takes no memory
+    found = tuple(np.empty((n_returns, *each.shape[1:]), dtype=each.dtype) for each in _NONE)
+    for first in range(0, len(stretches), _STRETCHES):
+        for part in in_threads(average, stretches[first : first + _STRETCHES]):
+            for whole, each in zip(found, part, strict=True):
+                whole[n : n + len(each)] = each
+            n += len(part[0])
+    points, paths_m, weights, counts, keys = (each[:n] for each in found)
     cell_of = number_cells(keys)
     return NearReturns(points, paths_m, weights, counts, cell_of, poses if map_T_odom is None else map_T_odom @ poses)
 
@@ -154,14 +163,14 @@ def make_cells(returns: NearReturns, *, with_folds: bool = True) -> SurfaceCells
     is_thinned = np.count_nonzero(counts > 1) < _THINNED * n
     kept = np.flatnonzero(counts >= (1 if is_thinned else _LEAST_RETURNS))
 
-    def sum_of(axis: int | None) -> Float64Array:
-        values = returns.weights if axis is None else returns.weights * returns.points[:, axis]
-        return np.bincount(group, values, n * n_folds).reshape(n, n_folds)[kept]
+    weights = np.bincount(group, returns.weights, n * n_folds).reshape(n, n_folds)[kept]
+    points, fold_offsets = np.empty((len(kept), 3)), np.empty((len(kept), n_folds, 3), dtype=np.float32)
 
-    weights, *sums = in_threads(sum_of, (None, 0, 1, 2))
-    points = np.stack([each.sum(axis=1) for each in sums], axis=1) / weights.sum(axis=1, keepdims=True)
-    with np.errstate(invalid="ignore"):
-        fold_offsets = np.stack(
-            [(each / weights - points[:, axis, None]).astype(np.float32) for axis, each in enumerate(sums)], axis=-1
-        )
+    def average(axis: int) -> None:
+        sums = np.bincount(group, returns.weights * returns.points[:, axis], n * n_folds).reshape(n, n_folds)[kept]
+        points[:, axis] = sums.sum(axis=1) / weights.sum(axis=1)
+        with np.errstate(invalid="ignore"):
+            fold_offsets[:, :, axis] = sums / weights - points[:, axis, None]
+
+    in_threads(average, range(3))
     return SurfaceCells(points, fold_offsets, cKDTree(points, balanced_tree=False), returns.map_T_sensor)

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.core.threads import in_threads
+from cdpipe.core.threads import allowed_threads, in_threads
 from cdpipe.surface.cells import N_FOLDS, SurfaceCells
 from cdpipe.surface.places import SurfacePlaces
 
@@ -99,17 +99,22 @@ def measure_offsets(
 
 def _find_surface(after: SurfaceCells, places: SurfacePlaces) -> Float64Array:
     """Return the (Q,) height along the normal at which the after surface is near; NaN where it is nowhere."""
-    start_m = np.where(after.tree.query(places.points, distance_upper_bound=_NEAR_M)[0] <= _NEAR_M, 0.0, np.nan)
+    start_m = np.where(_is_near(after, places.points), 0.0, np.nan)
     rest = np.flatnonzero(np.isnan(start_m))
     for step in range(1, int(_INTO_ROCK_M / _STEP_M) + 1):
         for height_m in (step * _STEP_M, -step * _STEP_M):
             if height_m > _INTO_VOID_M or len(rest) == 0:
                 continue
-            probes = places.points[rest] + height_m * places.normals[rest]
-            is_near = after.tree.query(probes, distance_upper_bound=_NEAR_M)[0] <= _NEAR_M
+            is_near = _is_near(after, places.points[rest] + height_m * places.normals[rest])
             start_m[rest[is_near]] = height_m
             rest = rest[~is_near]
     return start_m
+
+
+def _is_near(cells: SurfaceCells, points: Float64Array) -> BoolArray:
+    """Mark the (N, 3) points that have a cell nearby."""
+    distance_m, _ = cells.tree.query(points, distance_upper_bound=_NEAR_M, workers=allowed_threads())
+    return np.asarray(distance_m <= _NEAR_M)
 
 
 def _settle(
