@@ -95,9 +95,10 @@ def near_returns(merged: MergedMaps, session: SessionName) -> NearReturns:
     found = tuple(np.empty((n_returns, *each.shape[1:]), dtype=each.dtype) for each in _NONE)
     for first in range(0, len(stretches), _STRETCHES):
         for part in in_threads(average, stretches[first : first + _STRETCHES]):
+            end = n + len(part[0])
             for whole, each in zip(found, part, strict=True):
-                whole[n : n + len(each)] = each
-            n += len(part[0])
+                whole[n:end] = each
+            n = end
     points, paths_m, weights, counts, keys = (each[:n] for each in found)
     cell_of = number_cells(keys)
     return NearReturns(points, paths_m, weights, counts, cell_of, poses if map_T_odom is None else map_T_odom @ poses)

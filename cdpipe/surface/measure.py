@@ -55,9 +55,9 @@ _TILT_RAD, _CLOSE_M = 2e-3, 4.0
 _NEIGHBOURS = 8
 # Least share of the roughness that both spheres do not share, as standard deviation, and the least error of a mean.
 _ROUGHNESS, _LEAST_M = 0.18, 0.0004
-# Two means over few cells of one rough surface differ by that share of what they would if the cells were drawn anew from
-# a spread as wide. Where the cells lie on no single surface, as on wire mesh and the rock behind it, they are: each
-# session sees its own share of the wire, over whole patches. Places less flat than this are of that kind.
+# Two means over few cells of one rough surface differ by that share of what they would if each session drew its cells
+# from a spread as wide. Where the cells lie on no single surface, as on wire mesh and the rock behind it, each does:
+# it sees its own share of the wire, over whole patches. Places less flat than this are of that kind.
 _OF_ONE_SURFACE, _OF_SEVERAL, _SEVERAL_FLATNESS = 0.6, 1.2, 0.15
 
 

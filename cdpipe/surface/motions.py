@@ -28,11 +28,13 @@ _TO_SIGMA = 1.4826
 _LEAST_SIGMA_M = 3e-4
 # Rotation and translation that nothing constrains stay zero.
 _DAMPING = 1e-3
-# A residual that many times the noise says that much of a window moved. The fit is then begun on each half of the round
-# alone, too. It is taken where that share of the window is within twice the noise, more of it than by the first fit, and
-# most of what is within six times: what moved lies apart. Of a convergence all round no motion leaves such a part.
+# A residual that many times the noise says that much of a window moved. The fit is then begun on each half of the
+# round alone, too. It is taken where that share of the window is within twice the noise, more of it than by the first
+# fit, and most of what is within six times: what moved lies apart. No motion leaves such a part of a convergence all
+# round.
 _MUCH, _WITHIN, _NEAR = 3.0, 2.0, 6.0
 _LEAST_SHARE, _MORE, _APART = 0.3, 0.1, 0.7
+_NOISE_SAMPLE = 20_000  # about so many offsets tell the noise
 # Neighbouring places err together: a block of this edge counts as one observation in the covariance.
 _BLOCK_M = 1.0
 
@@ -128,8 +130,9 @@ def _find_noise(points: Float64Array, along_m: Float64Array) -> float:
     """Return the standard deviation by which offsets of neighbours differ, of one of them."""
     if len(points) < _LEAST_OFFSETS:
         return 0.0
-    nearest = np.asarray(cKDTree(points).query(points, k=[2], workers=allowed_threads())[1])[:, 0]
-    return _TO_SIGMA * float(np.median(np.abs(along_m - along_m[nearest]))) / np.sqrt(2.0)
+    some = np.arange(0, len(points), max(len(points) // _NOISE_SAMPLE, 1))
+    nearest = np.asarray(cKDTree(points).query(points[some], k=[2], workers=allowed_threads())[1])[:, 0]
+    return _TO_SIGMA * float(np.median(np.abs(along_m[some] - along_m[nearest])) / np.sqrt(2.0))
 
 
 def _fit_best(
