@@ -17,7 +17,7 @@ import numpy as np
 
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, transform, travelled_m
 from cdpipe.mapping.recorded_frames import merge_as_mapped
-from cdpipe.merge.candidates import Candidate, find_candidates, find_closest_pair
+from cdpipe.merge.candidates import Candidate, find_candidates, find_closest_pair, first_keyframes
 from cdpipe.merge.evidence import SurfaceFit, explain_refusal, measure_fit, sample_evenly
 from cdpipe.merge.global_registration import is_kiss_matcher_installed, register_globally
 from cdpipe.merge.refine import refine
@@ -180,15 +180,30 @@ def _find_hypothesis(
     best: _Hypothesis | None = None
     n_tried = 0
     if config.method == "voting":
-        starts = _rank_starts(find_candidates(before, after, config), maps, config)
-        best, n_tried = _choose_hypothesis(starts, maps, config)
-        is_accepted = best is not None and not explain_refusal(best.evidence, config)
-        if is_accepted or not (config.fallback and is_kiss_matcher_installed()):
-            return best, n_tried, config.fallback and not is_accepted
+        for every in _list_tries(before, after, config):
+            if every == 1:
+                before, after = before.described(), after.described()
+            starts = _rank_starts(find_candidates(before, after, config, every), maps, config)
+            found, n_found = _choose_hypothesis(starts, maps, config)
+            best, n_tried = found or best, n_tried + n_found
+            if best is not None and not explain_refusal(best.evidence, config):
+                return best, n_tried, False
+        if not (config.fallback and is_kiss_matcher_installed()):
+            return best, n_tried, config.fallback
     other, n_other = _choose_hypothesis(_start_by_kiss_matcher(maps, config), maps, config)
     if other is not None and (best is None or not explain_refusal(other.evidence, config)):
         best = other
     return best, n_tried + n_other, True
+
+
+def _list_tries(before: MappedSession, after: MappedSession, config: MergeConfig) -> tuple[int, ...]:
+    """Return every which keyframe to compare, one try after the other: all of short sessions at once."""
+    n_before, n_after = len(before.descriptors.q), len(after.descriptors.q)
+
+    def count(every: int) -> tuple[int, int]:
+        return len(first_keyframes(n_before, every, False)), len(first_keyframes(n_after, every, True))
+
+    return (1,) if count(config.first_every) == count(1) else (config.first_every, 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputWarning
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.io.ply import read_ply_points
+from cdpipe.merge.candidates import first_keyframes
 from cdpipe.merge.evidence import explain_refusal
 from cdpipe.merge.global_registration import is_kiss_matcher_installed
 from cdpipe.merge.merge import merge_maps, take_known_merge
@@ -63,6 +64,38 @@ def test_the_true_transform_is_found(
     assert merged.evidence["n_hypotheses"] == 1
     assert merged.evidence["is_fallback"] == 0
     assert set(merged.seconds) == {"t_index_s", "t_merge_s", "t_refine_s"}
+
+
+def test_the_other_keyframes_are_described_only_after_a_refusal(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array
+) -> None:
+    config = CONFIG.model_copy(update={"refine": "none", "first_every": 3})
+    asked: list[str] = []
+
+    def first_only(session: MappedSession, name: str, *, is_after: bool, is_wrong: bool = False) -> MappedSession:
+        whole, q = session.descriptors, np.zeros_like(session.descriptors.q)
+        rows = first_keyframes(len(q), config.first_every, is_after)
+        q[rows] = whole.q[rows[::-1]] if is_wrong else whole.q[rows]
+
+        def rest() -> DescriptorSet:
+            asked.append(name)
+            return whole
+
+        return MappedSession(session.map, replace(whole, q=q), rest)
+
+    before = first_only(tunnel_before, "before", is_after=False)
+    merged = merge_maps(before, first_only(tunnel_after, "after", is_after=True), config)
+    assert merged.is_accepted and asked == []
+    assert map_error_m(merged.before_T_after, true_before_T_after, tunnel_after.map.points) < 0.1
+    # the same from the vectors of all keyframes: laziness changes nothing
+    known = merge_maps(tunnel_before, tunnel_after, config)
+    np.testing.assert_array_equal(known.before_T_after, merged.before_T_after)
+    # where the first keyframes mislead, all decide, as if none had been compared first
+    misled = merge_maps(before, first_only(tunnel_after, "after", is_after=True, is_wrong=True), config)
+    assert misled.is_accepted and asked == ["before", "after"]
+    at_once = merge_maps(tunnel_before, tunnel_after, config.model_copy(update={"first_every": 1}))
+    np.testing.assert_array_equal(misled.before_T_after, at_once.before_T_after)
+    assert misled.evidence["n_hypotheses"] > at_once.evidence["n_hypotheses"]
 
 
 def test_without_refinement_one_transform_holds_everywhere(
