@@ -86,6 +86,16 @@ def first_keyframes(n_keyframes: int, every: int, is_after: bool) -> Int64Array:
     return chosen[_spread(len(chosen), _MAX_QUERIES)] if is_after else chosen
 
 
+def list_tries(before: MappedSession, after: MappedSession, config: MergeConfig) -> tuple[int, ...]:
+    """Return every which keyframe to compare, one try after the other: all of short sessions at once."""
+    n_before, n_after = len(before.descriptors.q), len(after.descriptors.q)
+
+    def count(every: int) -> tuple[int, int]:
+        return len(first_keyframes(n_before, every, False)), len(first_keyframes(n_after, every, True))
+
+    return (1,) if count(config.first_every) == count(1) else (config.first_every, 1)
+
+
 def find_candidates(
     before: MappedSession, after: MappedSession, config: MergeConfig, every: int = 1
 ) -> list[Candidate]:

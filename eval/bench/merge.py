@@ -6,8 +6,9 @@ less and costs 5 mm at most.
 
 Both methods end at an accepted rigid transform: ours starts from descriptors (all-in), stored vectors or indexed maps,
 the rival from two clouds. All-in counts the descriptors of the keyframes that the merge compares: the first ones, and
-all of them if these did not suffice. Refinement along the path is a row of its own, because the rival has no such step. The time
-of a wrong rival is not compared. Where ours is refused or wrong, the row gives the reason and misses its target.
+all of them if these did not suffice. Refinement along the path is a row of its own, because the rival has no such step.
+The time of a wrong rival is not compared. Where ours is refused or wrong, the row gives the reason and misses its
+target.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,11 +13,12 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputWarning
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.io.ply import read_ply_points
+from cdpipe.merge import merge
 from cdpipe.merge.candidates import first_keyframes
 from cdpipe.merge.evidence import explain_refusal
 from cdpipe.merge.global_registration import is_kiss_matcher_installed
 from cdpipe.merge.merge import merge_maps, take_known_merge
-from cdpipe.merge.registration import register
+from cdpipe.merge.registration import IndexedMap, register
 from cdpipe.model.config import MergeConfig, load_config
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps
 from cdpipe.pipeline import detect
@@ -64,6 +66,37 @@ def test_the_true_transform_is_found(
     assert merged.evidence["n_hypotheses"] == 1
     assert merged.evidence["is_fallback"] == 0
     assert set(merged.seconds) == {"t_index_s", "t_merge_s", "t_refine_s"}
+
+
+def test_a_long_map_is_indexed_where_it_is_looked_at(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = CONFIG.model_copy(update={"refine": "none", "first_every": 2})
+    whole = merge_maps(tunnel_before, tunnel_after, config)
+    made: list[IndexedMap] = []
+
+    class Recorded(IndexedMap):
+        def __init__(self, *args: Any, **settings: Any) -> None:
+            super().__init__(*args, **settings)
+            made.append(self)
+
+    monkeypatch.setattr(merge, "IndexedMap", Recorded)
+    monkeypatch.setattr(merge, "_LONG_M", 1.0)
+    merged = merge_maps(tunnel_before, tunnel_after, config)
+    assert merged.is_accepted and whole.is_accepted
+    assert map_error_m(merged.before_T_after, whole.before_T_after, tunnel_after.map.points) < 1e-3
+    assert merged.evidence == pytest.approx(whole.evidence, rel=1e-2)
+    before, after = made
+    assert before.local_s > 0 and after.local_s > 0
+    with pytest.raises(ValueError, match="not indexed as a target"):
+        _ = before.target  # the whole was never indexed
+    # far off the map the nearest point may be anywhere
+    nearest, squared_m2 = after.nearest_near(np.full(3, 500.0), 1.0, np.full((1, 3), 500.0))
+    apart_m = np.linalg.norm(after.points - 500.0, axis=1)
+    np.testing.assert_allclose(np.sqrt(squared_m2), apart_m.min())
+    np.testing.assert_array_equal(nearest[0], after.points[apart_m.argmin()])
+    merge_maps(tunnel_before, tunnel_after, CONFIG.model_copy(update={"refine": "none"}))
+    assert made[2].target is not None and made[2].local_s == 0.0  # as published: at once
 
 
 def test_the_other_keyframes_are_described_only_after_a_refusal(
