@@ -31,8 +31,8 @@ from cdpipe.descriptors.weights_file import checkpoint_bytes, digest, read_weigh
 from cdpipe.model.config import DescriptorConfig, MapConfig, PipelineConfig, SphereConfig
 from cdpipe.model.types import DescriptorSet, PosedScan, ScanSource
 
-# Scans described at a time: of more, the features do not fit the cache. The results are those of batches of twice as many,
-# to the byte, if what is left over from these is one batch.
+# Scans described at a time; the features of more do not fit the cache. The results are those of batches of twice as
+# many, to the byte, if what is left over from these is one batch.
 _BATCH = 16
 _SHIPPED = SphereConfig()
 _FILE = {
