@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.geometry import Float64Array, invert, plane_jacobian, transform
-from cdpipe.merge.registration import IndexedMap
+from cdpipe.merge.registration import IndexedMap, search_nearest
 from cdpipe.model.config import MergeConfig
 
 # Name of the evidence, and the setting of `merge` that is its lower limit.
@@ -82,9 +82,9 @@ def measure_fit(
     """
     fine = before.target
     moved = transform(before_T_after, own)
-    found, squared_m2 = fine.tree.batch_nearest_neighbor_search(moved)
+    found, squared_m2 = search_nearest(fine.tree, moved)
     normals = fine.normals[found]
-    forward_m = plane_distances(moved, fine.points[found], normals, np.asarray(squared_m2))
+    forward_m = plane_distances(moved, fine.points[found], normals, squared_m2)
     is_seen = np.isfinite(forward_m)
     jacobian = plane_jacobian(own[is_seen] - centre_after, normals[is_seen] @ before_T_after[:3, :3])
     information = jacobian.T @ jacobian
@@ -92,9 +92,9 @@ def measure_fit(
     centre_before = transform(before_T_after, centre_after[None])[0]
     chosen = sample_evenly(before.columns.crop(centre_before, radius_m))
     theirs = transform(invert(before_T_after), before.points[chosen])
-    found, squared_m2 = after.tree.batch_nearest_neighbor_search(theirs)
+    found, squared_m2 = search_nearest(after.tree, theirs)
     turned = fine.normals[chosen] @ before_T_after[:3, :3]
-    backward_m = plane_distances(theirs, after.points[found], turned, np.asarray(squared_m2))
+    backward_m = plane_distances(theirs, after.points[found], turned, squared_m2)
     return SurfaceFit(forward_m, backward_m, information)
 
 
