@@ -107,7 +107,7 @@ class RecordedScans:
         column_poses = self._chunk.column_poses[row].astype(np.float64)
         require_unit_poses(column_poses, lambda column: f"{where}, column {column}")
         range_mm = self._chunk.range_mm[row]
-        hits = np.flatnonzero(range_mm)
+        hits = np.flatnonzero(range_mm > 0)
         if not len(hits):
             raise InputError(f"{where} holds no return: remove the scan and its pose from the recording")
         points = deskew(self.session.sensor.project(range_mm / 1000.0), column_poses)

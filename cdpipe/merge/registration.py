@@ -11,7 +11,16 @@ import small_gicp
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, invert, make_pose, plane_jacobian, transform
+from cdpipe.core.geometry import (
+    BoolArray,
+    Float32Array,
+    Float64Array,
+    Int64Array,
+    invert,
+    make_pose,
+    plane_jacobian,
+    transform,
+)
 from cdpipe.core.grid_index import GridIndex, column_keys
 from cdpipe.core.voxel import cell_keys
 from cdpipe.model.config import MergeConfig
