@@ -159,7 +159,8 @@ def _per_stretch(
         chosen, nearest, moved = chosen[is_pair], nearest[is_pair], moved[is_pair]
         distances_m = np.einsum("ij,ij->i", moved - before.points[nearest], before.target.normals[nearest])
         normals = before.target.normals[nearest] @ pose[:3, :3]
-        seen_from = (after.seen_from[chosen] + transform(invert(pose), before.seen_from[nearest])) / 2
+        seen_there = transform(invert(pose), before.seen_from[nearest].astype(np.float64))
+        seen_from = (after.seen_from[chosen] + seen_there) / 2
         jacobian = plane_jacobian(after.points[chosen] - centre, normals)
         ahead_m = np.einsum("ij,ij->i", normals, seen_from - centre)
         result[a] = solve_point_to_plane(jacobian, distances_m, ahead_m)
