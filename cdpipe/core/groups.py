@@ -18,7 +18,8 @@ def label_groups(points: Float64Array, link_m: float) -> tuple[Int64Array, Int64
     n = len(points)
     if n == 0:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    pairs = cKDTree(points).query_pairs(link_m, output_type="ndarray")
+    # a tree that is searched once pays neither for balance nor for tight boxes
+    pairs = cKDTree(points, balanced_tree=False, compact_nodes=False).query_pairs(link_m, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
     _, labels = connected_components(graph, directed=False)
     return labels.astype(np.int64), np.bincount(labels)

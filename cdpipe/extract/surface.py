@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.groups import label_groups
 from cdpipe.core.voxel import cell_means
-from cdpipe.merge.registration import Surface
+from cdpipe.merge.registration import Surface, search_nearest
 from cdpipe.model.config import ExtractConfig
 
 # Point-to-plane distance of a candidate: below the height of the lowest objects, above the error of a map point.
@@ -93,9 +93,8 @@ def distances_m(points: Float64Array, surface: Surface, plane_m: float) -> tuple
 
 def find_nearest(points: Float64Array, surface: Surface) -> tuple[Int64Array, Float64Array]:
     """Return the (N,) index of the surface point nearest to each of (N, 3) points, and its distance, metres."""
-    # the k-nearest search returns arrays; the nearest search returns lists, which are slow to convert
-    found, squared_m2 = surface.tree.batch_knn_search(points, 1)
-    return found[:, 0].astype(np.int64), np.sqrt(squared_m2[:, 0])
+    found, squared_m2 = search_nearest(surface.tree, points)
+    return found, np.sqrt(squared_m2)
 
 
 class PlaneTable:

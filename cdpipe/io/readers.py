@@ -107,20 +107,22 @@ class RecordedScans:
         column_poses = self._chunk.column_poses[row].astype(np.float64)
         require_unit_poses(column_poses, lambda column: f"{where}, column {column}")
         range_mm = self._chunk.range_mm[row]
-        is_hit = range_mm > 0
-        if not is_hit.any():
+        hits = np.flatnonzero(range_mm > 0)
+        if not len(hits):
             raise InputError(f"{where} holds no return: remove the scan and its pose from the recording")
         points = deskew(self.session.sensor.project(range_mm / 1000.0), column_poses)
-        stamps = np.broadcast_to(self._chunk.column_stamps_ns[row], is_hit.shape)
+        rows, columns = np.divmod(hits, range_mm.shape[1])
+        by_column = points.swapaxes(0, 1).reshape(-1, 3)  # as `deskew` made them: no copy
+        signal = self._chunk.signal[row]
         return PosedScan(
             index=index,
-            points_sensor=points[is_hit],
+            points_sensor=by_column.take(columns * len(range_mm) + rows, axis=0),
             odom_T_sensor=self.odom_T_sensor[index],
-            stamps_ns=stamps[is_hit],
-            pixels=np.flatnonzero(is_hit).astype(np.int32),
-            signal=self._chunk.signal[row][is_hit] if self._chunk.signal[row].any() else None,
-            second_from=is_hit.size // 2 if self.session.n_returns == 2 else None,
-            intensity=self._chunk.reflectivity[row][is_hit].astype(np.float32),
+            stamps_ns=self._chunk.column_stamps_ns[row].take(columns),
+            pixels=hits.astype(np.int32),
+            signal=signal.ravel().take(hits) if signal.any() else None,
+            second_from=range_mm.size // 2 if self.session.n_returns == 2 else None,
+            intensity=self._chunk.reflectivity[row].ravel().take(hits).astype(np.float32),
         )
 
     def scans(self) -> Iterator[PosedScan]:

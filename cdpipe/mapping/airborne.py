@@ -61,6 +61,7 @@ class ClearScans(WrappedScans):
         """Take a session, and what `drop_airborne` takes."""
         super().__init__(source)
         self._lies_on_surface = lies_on_surface
+        self._clear: set[int] = set()  # scans of clear air that were read: they are not examined again
         self.has_dropped = False
 
     def scan(self, index: int) -> PosedScan:
@@ -78,10 +79,16 @@ class ClearScans(WrappedScans):
         do not agree: many of their returns look airborne. But a few returns of a place are kept in other scans; air is
         not met in one place again.
         """
-        return ClearScans(self._source, _surface_of(point_map))
+        supported = ClearScans(self._source, _surface_of(point_map))
+        supported._clear = self._clear
+        return supported
 
     def _cleared(self, scan: PosedScan) -> PosedScan:
+        if scan.index in self._clear:
+            return scan
         cleared = drop_airborne(scan, self._lies_on_surface)
+        if cleared is scan:
+            self._clear.add(scan.index)
         self.has_dropped |= cleared is not scan
         return cleared
 

@@ -20,7 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray, Float64Array, invert
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert
 from cdpipe.mapping.counted import OnStep
 from cdpipe.mapping.loops import Loop, close_loops, find_loops
 from cdpipe.mapping.scan_registration import Registration, Samples, Target, register_scan
@@ -33,6 +33,7 @@ _BEHIND_M, _RENEWED_M = 10.0, 1.0
 # Scans agree already if a sweep moves nine of ten by no more than this: 0.4 to 0.6 cm at constant drift, 4 cm with
 # KISS-ICP (validation tunnels of `narrow` and `wide`).
 _AGREE_M = 0.015
+_ROUNDING = 1e-9  # of an interpolated percentile
 # A scan is bent if so many of its points are off the walls, and so many times as many as of the scans around it.
 _BENT_SHARE, _BENT_FACTOR = 0.05, 3.0
 _FOLLOWING = Registration(voxel_m=0.3, correspondence_m=1.0, robust_m=0.2, step_m=0.2, step_rad=0.02)
@@ -90,8 +91,7 @@ def make_consistent(
     if len(poses) == 1:
         return ConsistentScans(source, poses, is_bent)
     scans, told = Samples(source), _Told(on_step, len(poses))
-    moved_m = np.linalg.norm((_sweep(scans, poses, _WITH_ALL, told)[0] - poses)[:, :3, 3], axis=1)
-    if np.percentile(moved_m, 90) > _AGREE_M:
+    if not _agree(scans, poses, told):
         poses = _follow(scans, _FOLLOWING, told)
         poses, off_share = _sweep(scans, poses, _BY_HALVES, told, by_halves=True)
         is_bent = _find_bent(scans.path_m, off_share)
@@ -100,6 +100,21 @@ def make_consistent(
     if loops:
         poses, _ = _sweep(scans, close_loops(scans.path_m, poses, loops), _WITH_ALL, told, loops=loops)
     return ConsistentScans(source, poses, is_bent)
+
+
+def _agree(scans: Samples, poses: Float64Array, told: _Told) -> bool:
+    """Return whether a sweep moves nine of ten scans by no more than `_AGREE_M`; it ends as soon as that is certain."""
+    n, moved_m = len(poses), np.zeros(len(poses))
+    below = int(0.9 * (n - 1))  # the 90th percentile lies between this one of the sorted values and the next
+    n_near = n_far = 0
+    told.begin()
+    for own, found, _ in _sweep_blocks(scans, poses, _WITH_ALL, told):
+        moved_m[own] = np.linalg.norm((found - poses[own])[:, :3, 3], axis=1)
+        n_near += int(np.count_nonzero(moved_m[own] < _AGREE_M * (1 - _ROUNDING)))
+        n_far += int(np.count_nonzero(moved_m[own] > _AGREE_M * (1 + _ROUNDING)))
+        if n_near >= below + 2 or n_far >= n - below:
+            break
+    return not np.percentile(moved_m, 90) > _AGREE_M
 
 
 class _Told:
@@ -167,6 +182,23 @@ def _sweep(
     """
     found, off_share = poses.copy(), np.zeros(len(poses))
     told.begin()
+    for own, found_of_block, off_share_of_block in _sweep_blocks(
+        scans, poses, settings, told, by_halves=by_halves, loops=loops
+    ):
+        found[own], off_share[own] = found_of_block, off_share_of_block
+    return found, off_share
+
+
+def _sweep_blocks(
+    scans: Samples,
+    poses: Float64Array,
+    settings: Registration,
+    told: _Told,
+    *,
+    by_halves: bool = False,
+    loops: tuple[Loop, ...] = (),
+) -> Iterator[tuple[Int64Array, Float64Array, Float64Array]]:
+    """Yield (B,) scans of each block, their (B, 4, 4) poses and (B,) shares; arguments as of `_sweep`."""
     steps = invert(scans.recorded[:-1]) @ scans.recorded[1:]
     blocks = np.floor(scans.path_m / _BLOCK_M)
     for block in np.unique(blocks):
@@ -178,15 +210,16 @@ def _sweep(
             continue
         first = Target(scans, poses, halves[0], centre, settings.voxel_m)
         second = Target(scans, poses, halves[1], centre, settings.voxel_m) if by_halves else first
-        for index in own.tolist():
+        found, off_share = poses[own], np.zeros(len(own))
+        for number, index in enumerate(own.tolist()):
             predicted = [poses[index - 1] @ steps[index - 1]] if index else []
             predicted += [poses[index + 1] @ invert(steps[index])] if index + 1 < len(poses) else []
             target = first if index % 2 == 0 else second
-            found[index], off_share[index] = register_scan(
+            found[number], off_share[number] = register_scan(
                 scans.of_scan(index), poses[index], predicted, target, settings
             )
             told.add()
-    return found, off_share
+        yield own, found, off_share
 
 
 def _is_near(path_m: Float64Array, first: int, last: int, loops: tuple[Loop, ...]) -> BoolArray:

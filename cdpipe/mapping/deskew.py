@@ -21,5 +21,6 @@ def deskew(points_column: Float64Array, column_poses: Float64Array) -> Float64Ar
     require_shape("column_poses", column_poses, (points_column.shape[1], 7))
     rotations = Rotation.from_quat(column_poses[:, 3:]).as_matrix()
     # (W, H, 3) @ (W, 3, 3): one small product per column
-    turned = points_column.swapaxes(0, 1) @ rotations.swapaxes(1, 2) + column_poses[:, None, :3]
+    turned = points_column.swapaxes(0, 1) @ rotations.swapaxes(1, 2)
+    turned += column_poses[:, None, :3]
     return turned.swapaxes(0, 1)

@@ -108,29 +108,35 @@ class _MapAccumulator:
         self._n_returns: list[int] = []
 
     def add(self, scans: list[PosedScan]) -> None:
-        clouds, ranges_m2, n_near = [], [], []
-        for scan in scans:
-            squared_m2 = np.einsum("ij,ij->i", scan.points_sensor, scan.points_sensor)
-            is_near = squared_m2 <= self._config.max_range_m**2
-            ranges_m2.append(np.maximum(squared_m2[is_near], _MIN_RANGE_M**2))
-            clouds.append(transform(scan.odom_T_sensor, scan.points_sensor[is_near]))
-            self._return_pixels.append(scan.pixels[is_near])
-            n_near.append(len(clouds[-1]))
-            if scan.index in self._keyframe_scans:
-                self._views.append(render_view(scan.points_sensor))
-        self._n_returns += n_near
-        points = np.concatenate(clouds)
-        ids = self._cells.add(cell_keys(points, self._config.voxel_m))
+        # scan by scan, as long as arrays fit into the cache; the sums are those of the whole batch
+        parts = [self._add_scan(scan) for scan in scans]
+        keys, squared_m2, weights = (np.concatenate([part[k] for part in parts]) for k in range(3))
+        ids = self._cells.add(keys)
         self._return_cells.append(ids)
-        in_cells = points / self._config.voxel_m
+        weighted = np.concatenate([part[3] for part in parts], axis=1)
+        self._add_sums(ids, [*weighted, weights], squared_m2)
+
+    def _add_scan(self, scan: PosedScan) -> tuple[Int64Array, Float64Array, Float64Array, Float64Array]:
+        """Return of (N,) returns within range the cells, squared ranges, weights, and (6, N) weighted sums' terms."""
+        voxel_m = self._config.voxel_m
+        squared_m2 = np.einsum("ij,ij->i", scan.points_sensor, scan.points_sensor)
+        near = np.flatnonzero(squared_m2 <= self._config.max_range_m**2)
+        squared_m2 = np.maximum(squared_m2.take(near), _MIN_RANGE_M**2)
+        points = transform(scan.odom_T_sensor, scan.points_sensor.take(near, axis=0))
+        self._return_pixels.append(scan.pixels.take(near))
+        self._n_returns.append(len(near))
+        if scan.index in self._keyframe_scans:
+            self._views.append(render_view(scan.points_sensor))
+        in_cells = points / voxel_m
+        in_cells -= np.floor(in_cells)
+        in_cells *= PLACES
         # just below a border the fraction rounds to 1
-        self._return_offsets.append(np.minimum((in_cells - np.floor(in_cells)) * PLACES, PLACES - 1).astype(np.uint8))
-        sensors = np.array([scan.odom_T_sensor[:3, 3] for scan in scans])
-        squared_m2 = np.concatenate(ranges_m2)
+        self._return_offsets.append(np.minimum(in_cells, PLACES - 1, out=in_cells).astype(np.uint8))
         weights = 1 / squared_m2
-        columns = [points[:, axis] * weights for axis in range(3)]
-        columns += [np.repeat(sensors[:, axis], n_near) * weights for axis in range(3)]
-        self._add_sums(ids, [*columns, weights], squared_m2)
+        terms = np.empty((6, len(near)))
+        np.multiply(points.T, weights, out=terms[:3])
+        np.multiply(scan.odom_T_sensor[:3, 3, None], weights, out=terms[3:])
+        return cell_keys(points, voxel_m), squared_m2, weights, terms
 
     def _add_sums(self, ids: Int64Array, columns: Sequence[Float64Array], squared_m2: Float64Array) -> None:
         n_known, n_cells = len(self._sums), len(self._cells)

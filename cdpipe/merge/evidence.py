@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.geometry import Float64Array, invert, plane_jacobian, transform
-from cdpipe.merge.registration import IndexedMap
+from cdpipe.merge.registration import IndexedMap, search_nearest
 from cdpipe.model.config import MergeConfig
 
 # Name of the evidence, and the setting of `merge` that is its lower limit.
@@ -83,9 +83,9 @@ def measure_fit(
     centre_before = transform(before_T_after, centre_after[None])[0]
     fine, rows = before.target_near(centre_before, radius_m + _COUNTERPART_M)
     moved = transform(before_T_after, own)
-    found, squared_m2 = fine.tree.batch_nearest_neighbor_search(moved)
+    found, squared_m2 = search_nearest(fine.tree, moved)
     normals = fine.normals[found]
-    forward_m = plane_distances(moved, fine.points[found], normals, np.asarray(squared_m2))
+    forward_m = plane_distances(moved, fine.points[found], normals, squared_m2)
     is_seen = np.isfinite(forward_m)
     jacobian = plane_jacobian(own[is_seen] - centre_after, normals[is_seen] @ before_T_after[:3, :3])
     information = jacobian.T @ jacobian

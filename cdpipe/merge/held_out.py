@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, make_pose, transform, transform_each, travelled_m
 from cdpipe.core.grid_index import GridIndex
 from cdpipe.merge.evidence import plane_distances, sample_evenly
-from cdpipe.merge.registration import IndexedMap
+from cdpipe.merge.registration import IndexedMap, search_nearest
 
 # One of so many after points is held out.
 HELD_OUT_EVERY = 5
@@ -81,8 +81,8 @@ def choose_alignment(
 def _measure_misfit(before: IndexedMap, before_T_after: Float64Array, own: Float64Array) -> float:
     """Return the mean misfit of (N, 3) after points, in [0, 1]."""
     surface, moved = before.target, transform(before_T_after, own)
-    found, squared_m2 = surface.tree.batch_nearest_neighbor_search(moved)
-    distances_m = plane_distances(moved, surface.points[found], surface.normals[found], np.asarray(squared_m2))
+    found, squared_m2 = search_nearest(surface.tree, moved)
+    distances_m = plane_distances(moved, surface.points[found], surface.normals[found], squared_m2)
     return float(np.mean(1 - 1 / (1 + (distances_m / _MISFIT_M) ** 2)))
 
 

@@ -21,7 +21,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, pl
 from cdpipe.merge.evidence import sample_evenly
 from cdpipe.merge.held_out import HELD_OUT_EVERY, choose_alignment
 from cdpipe.merge.pose_graph import solve_pose_graph
-from cdpipe.merge.registration import IndexedMap, solve_point_to_plane
+from cdpipe.merge.registration import IndexedMap, search_nearest, solve_point_to_plane
 from cdpipe.merge.walk import Step, Walk, walk
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import MergeConfig
@@ -154,12 +154,13 @@ def _per_stretch(
         centre, pose = after.positions[walked.keyframes[a]], walked.before_T_after[a]
         chosen = sample_evenly(after.columns.crop(centre, radius_m))
         moved = transform(pose, after.points[chosen])
-        nearest, squared_m2 = before.target.tree.batch_nearest_neighbor_search(moved)
-        is_pair = np.asarray(squared_m2) < _COUNTERPART_M**2
-        chosen, nearest, moved = chosen[is_pair], np.asarray(nearest)[is_pair], moved[is_pair]
+        nearest, squared_m2 = search_nearest(before.target.tree, moved)
+        is_pair = squared_m2 < _COUNTERPART_M**2
+        chosen, nearest, moved = chosen[is_pair], nearest[is_pair], moved[is_pair]
         distances_m = np.einsum("ij,ij->i", moved - before.points[nearest], before.target.normals[nearest])
         normals = before.target.normals[nearest] @ pose[:3, :3]
-        seen_from = (after.seen_from[chosen] + transform(invert(pose), before.seen_from[nearest])) / 2
+        seen_there = transform(invert(pose), before.seen_from[nearest].astype(np.float64))
+        seen_from = (after.seen_from[chosen] + seen_there) / 2
         jacobian = plane_jacobian(after.points[chosen] - centre, normals)
         ahead_m = np.einsum("ij,ij->i", normals, seen_from - centre)
         result[a] = solve_point_to_plane(jacobian, distances_m, ahead_m)

@@ -242,6 +242,13 @@ def register(
     return np.asarray(fine.T_target_source @ make_pose(translation=-centre))
 
 
+def search_nearest(tree: small_gicp.KdTree, points: Float64Array) -> tuple[Int64Array, Float64Array]:
+    """Return the (N,) index of the tree's point nearest to each of (N, 3) points, and the (N,) squared distances."""
+    # the k-nearest search returns arrays; the nearest search returns lists, which are slow to convert
+    found, squared_m2 = tree.batch_knn_search(points, 1)
+    return found[:, 0].astype(np.int64), squared_m2[:, 0]
+
+
 def align_by_gicp(
     points: Float64Array,
     centre: Float64Array,
@@ -291,13 +298,15 @@ def align_to_planes(
     centred = points - centre
     for _ in range(_PLANE_STEPS):
         moved = transform(pose, centred)
-        found, squared_m2 = target.tree.batch_nearest_neighbor_search(moved)
-        is_pair = np.asarray(squared_m2) < correspondence_m**2
-        if np.count_nonzero(is_pair) < _MIN_PAIRS:
+        found, squared_m2 = search_nearest(target.tree, moved)
+        pairs = np.flatnonzero(squared_m2 < correspondence_m**2)
+        if len(pairs) < _MIN_PAIRS:
             break
-        chosen = np.asarray(found)[is_pair]
-        distances_m = np.einsum("ij,ij->i", moved[is_pair] - target.points[chosen], target.normals[chosen])
-        jacobian = plane_jacobian(centred[is_pair], target.normals[chosen] @ pose[:3, :3])
+        chosen = found.take(pairs)
+        normals = target.normals.take(chosen, axis=0)
+        offsets = moved.take(pairs, axis=0) - target.points.take(chosen, axis=0)
+        distances_m = np.einsum("ij,ij->i", offsets, normals)
+        jacobian = plane_jacobian(centred.take(pairs, axis=0), normals @ pose[:3, :3])
         step = -solve_point_to_plane(jacobian, distances_m, distances_m)
         pose = pose @ make_pose(Rotation.from_rotvec(step[:3]).as_matrix(), step[3:])
         if np.abs(step).max() < _PLANE_CONVERGED:  # metres, radians

@@ -103,7 +103,9 @@ class SensorMetadata:
             )
         if rows != self.height:
             return np.concatenate([self.project(part) for part in np.split(ranges_m, 2, axis=-2)], axis=-3)
-        return np.asarray(self.origins + (ranges_m[..., None] - self.beam_origin_m) * self.directions, dtype=np.float64)
+        points = np.asarray((ranges_m[..., None] - self.beam_origin_m) * self.directions, dtype=np.float64)
+        points += self.origins
+        return points
 
     def column_offsets_ns(self) -> Float64Array:
         """Return the (W,) time of each column after the start of its revolution, nanoseconds."""

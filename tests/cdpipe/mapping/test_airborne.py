@@ -13,7 +13,8 @@ import cdpipe
 from cdpipe.core.geometry import Float64Array, Int32Array
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
-from cdpipe.mapping.airborne import ClearScans, clear, drop_airborne
+from cdpipe.mapping import airborne
+from cdpipe.mapping.airborne import ClearScans, LiesOnSurface, clear, drop_airborne
 from cdpipe.mapping.mapping import build_map
 from cdpipe.model.config import MapConfig, load_config
 from cdpipe.model.types import PosedScan, WrappedScans
@@ -92,6 +93,34 @@ def test_only_a_dusty_scan_loses_returns() -> None:
     # a dark wall that runs away from beam to beam is no dust: its ranges follow a line
     steep = scan_of(np.linspace(3.0, 19.0, WIDTH) ** 1.05, np.full(WIDTH, 12))
     assert drop_airborne(steep) is steep
+
+
+class Held(WrappedScans):
+    """A session of one scan."""
+
+    def __init__(self, held: PosedScan) -> None:
+        self._held = held
+
+    def scan(self, index: int) -> PosedScan:
+        return self._held
+
+
+@pytest.mark.parametrize("is_dusty", [False, True])
+def test_a_scan_of_clear_air_is_examined_once_and_a_dusty_one_again(
+    is_dusty: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scan = scan_of(*(in_mist(*wall()) if is_dusty else wall()))
+    examined: list[int] = []
+
+    def examine(scan: PosedScan, lies_on_surface: LiesOnSurface | None) -> PosedScan:
+        examined.append(scan.index)
+        return drop_airborne(scan, lies_on_surface)
+
+    monkeypatch.setattr(airborne, "drop_airborne", examine)
+    cleared = ClearScans(Held(scan))
+    scans = [cleared.scan(0) for _ in range(2)]
+    assert len(examined) == (2 if is_dusty else 1) and cleared.has_dropped == is_dusty
+    assert [len(each.pixels) for each in scans] == 2 * [len(drop_airborne(scan).pixels)]
 
 
 def test_a_sensor_that_tells_no_signal_keeps_everything() -> None:

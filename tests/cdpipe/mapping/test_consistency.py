@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream
+from cdpipe.mapping import consistency
 from cdpipe.mapping.consistency import make_consistent
 from cdpipe.mapping.mapping import build_map
 from cdpipe.mapping.scan_registration import spread
@@ -58,6 +59,29 @@ def test_jitter_from_scan_to_scan_goes(tunnel: CloudScans) -> None:
 
 def test_scans_that_agree_keep_their_recorded_poses(tunnel: CloudScans) -> None:
     np.testing.assert_array_equal(make_consistent(tunnel).odom_T_sensor, tunnel.odom_T_sensor)
+
+
+def test_the_first_sweep_ends_once_it_is_certain_and_decides_as_a_whole_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng, n_blocks_seen = np.random.default_rng(0), []
+    for n in (2, 3, 10, 11, 12, 21, 40):
+        for share in (0.0, 0.05, 0.1, 0.15, 0.5):
+            moved_m = np.where(rng.random(n) < share, 0.02, 0.01)
+            moved = make_pose(translation=np.column_stack([moved_m, np.zeros((n, 2))]))
+            given: list[int] = []
+
+            def blocks(*_: object, moved: Float64Array = moved, given: list[int] = given, **__: object) -> object:
+                for own in np.array_split(np.arange(len(moved)), max(1, len(moved) // 3)):
+                    given.append(len(own))
+                    yield own, moved[own], np.zeros(len(own))
+
+            monkeypatch.setattr(consistency, "_sweep_blocks", blocks)
+            told = consistency._Told(lambda step, done, total: None, n)
+            decided = consistency._agree(None, np.repeat(np.eye(4)[None], n, axis=0), told)  # type: ignore[arg-type]
+            assert decided == (np.percentile(moved_m, 90) <= 0.015)
+            n_blocks_seen.append((sum(given), n))
+    assert any(seen < n / 2 for seen, n in n_blocks_seen)
 
 
 def test_a_scan_that_was_shaken_within_its_revolution_adds_no_points(tunnel: CloudScans) -> None:
