@@ -29,6 +29,7 @@ from cdpipe.merge.registration import (
     motion_between,
     register,
 )
+from cdpipe.merge.rings import explain_rings, measure_rings
 from cdpipe.merge.walk import Step, Walk, choose_evenly, is_shared, walk
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import MergeConfig
@@ -76,8 +77,8 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     points within `inlier_m` of the other surface, and median distance, around the start), `hessian_ratio` (smallest to
     largest eigenvalue of the translation's Hessian, whole path), `agreement` (mean inlier share along the path),
     `distinctness` (residual of the best rival alignment divided by this one's; 10 without a rival),
-    `descriptor_distance`, `n_hypotheses` walked, `is_fallback`, and `kiss_matcher`: 1 if KISS-Matcher was asked, 0 if
-    it was wanted and is not installed.
+    `line_share` of a short path (`rings`), `descriptor_distance`, `n_hypotheses` walked, `is_fallback`, and
+    `kiss_matcher`: 1 if KISS-Matcher was asked, 0 if it was wanted and is not installed.
 
     Returns:
         The best hypothesis with the reason of a refusal; the identity if nothing could be registered.
@@ -95,8 +96,8 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     seconds = {"t_index_s": indexed - start, "t_merge_s": perf_counter() - indexed, "t_refine_s": 0.0}
     if best is None:
         return MergedMaps(before.map, after.map, np.eye(4), evidence, False, _TOO_FEW, seconds=seconds)
-    evidence = {**best.evidence, **evidence}
-    reason = "" if config.accept_all else explain_refusal(evidence, config)
+    evidence = {**best.evidence, **evidence, **measure_rings(before, after, config.seen_within_m)}
+    reason = "" if config.accept_all else explain_refusal(evidence, config) or explain_rings(evidence)
     if reason and config.fallback and not is_kiss_matcher_installed():
         reason += " (KISS-Matcher could not be asked: pip install 'tunnelcd[kiss]')"
     before_T_after, local = best.before_T_after, None
@@ -117,7 +118,8 @@ def take_known_merge(
     """Return both maps with an alignment that the user knows; no gate is asked.
 
     Evidence: `is_known` is 1; the other measurements are those of a walk that starts at the known alignment. With
-    `config.refine` the alignment is refined along the path, and stays as it is where the refinement does not fit. A
+    `config.refine` the alignment is refined along the path, and stays as it is where the refinement does not fit, or
+    where both maps are rings that lie apart (`rings`). A
     checked refinement moves no place by more than 1 m or 1 % of the after path, if that is more.
 
     Args:
@@ -140,17 +142,19 @@ def take_known_merge(
     indexed = perf_counter()
     distances_m, _ = maps[0].path.query(transform(before_T_after, maps[1].positions))
     found = _judge(_Start(int(np.argmin(distances_m)), before_T_after, known), maps, config)
-    evidence, local, refined = dict(found.evidence), known_local, before_T_after
+    evidence = {**found.evidence, **measure_rings(before, after, config.seen_within_m)}
+    local, refined = known_local, before_T_after
     walked = perf_counter()
     within_m = np.inf
     if config.refine == "checked":
         within_m = max(_KNOWN_M, _KNOWN_SHARE * float(travelled_m(after.map.odom_T_keyframe)[-1]))
-    if config.refine != "none" and "both_ways_m" in evidence:
+    has_refinement = config.refine != "none" and not explain_rings(evidence)
+    if has_refinement and "both_ways_m" in evidence:
         place = maps[1].positions[found.walk.keyframes[0]]
         is_near = motion_between(found.before_T_after, before_T_after, place)[0] <= within_m
         if is_near and not explain_refusal(evidence, config):
             local, refined = None, found.before_T_after
-    elif config.refine != "none":
+    elif has_refinement:
         del maps
         fitted, measured = refine(before.map, after.map, found.walk, before_T_after, config, within_m)
         evidence |= measured
@@ -159,7 +163,7 @@ def take_known_merge(
     seconds = {
         "t_index_s": indexed - start,
         "t_merge_s": walked - indexed,
-        "t_refine_s": perf_counter() - walked if config.refine != "none" else 0.0,
+        "t_refine_s": perf_counter() - walked if has_refinement else 0.0,
     }
     return replace(merged, before_T_after=refined, evidence=evidence, local=local, seconds=seconds)
 

@@ -297,6 +297,25 @@ def test_a_standing_sensor_is_merged_by_what_there_is(n_scans: int) -> None:
     np.testing.assert_array_equal(as_it_is.before_T_after, off)
 
 
+def test_a_short_recording_of_single_rings_is_refused_and_a_known_merge_of_it_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    before, after = stand(30.0, 0, np.eye(4)), stand(30.6, 1, AFTER_ODOM_T_WORLD)
+    assert merge_maps(before, after, CONFIG).evidence["line_share"] < 0.05
+    monkeypatch.setattr("cdpipe.merge.rings.MAX_LINE_SHARE", -1.0)  # as if these were rings
+    merged = merge_maps(before, after, CONFIG)
+    assert not merged.is_accepted and "line_share" in merged.reason
+    assert merge_maps(before, after, CONFIG.model_copy(update={"accept_all": True})).is_accepted
+    off = make_pose(translation=(0.2, 0.1, 0.0)) @ invert(AFTER_ODOM_T_WORLD)
+    known = take_known_merge(before, after, off, CONFIG)
+    assert known.is_accepted
+    np.testing.assert_array_equal(known.before_T_after, off)
+
+
+def test_a_long_path_is_not_asked_for_rings(tunnel_before: MappedSession, tunnel_after: MappedSession) -> None:
+    assert "line_share" not in merge_maps(tunnel_before, tunnel_after, CONFIG).evidence
+
+
 def test_a_standing_sensor_finds_its_place_in_a_drive(tunnel_before: MappedSession) -> None:
     true = invert(AFTER_ODOM_T_WORLD)
     merged = merge_maps(tunnel_before, stand(30.6, 1, AFTER_ODOM_T_WORLD), CONFIG)
