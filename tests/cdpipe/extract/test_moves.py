@@ -297,3 +297,37 @@ def test_a_fragment_beside_the_place_is_no_twin_of_the_whole() -> None:
 def test_a_crate_a_fifth_larger_is_no_twin_though_it_is_nearer() -> None:
     crate = box((1.0, 0.7, 0.6), "lrfb")
     assert linked(moves([crate], [shifted(1.2 * crate, 2.0), shifted(crate, 9.0)])) == {(0, 1)}
+
+
+def leaning(points: Float64Array, lean_deg: float, towards_deg: float) -> Float64Array:
+    """Points in a map that is tilted towards a heading."""
+    turn = Rotation.from_euler("zyz", [-towards_deg, lean_deg, towards_deg], degrees=True).as_matrix()
+    return points @ turn.T
+
+
+@pytest.mark.parametrize(("lean_deg", "yaw_rad"), [(9.0, 2.2), (12.0, 3.1)])
+def test_a_chair_that_leans_with_its_map_is_the_one_that_leant_another_way_elsewhere(
+    lean_deg: float, yaw_rad: float
+) -> None:
+    # Drift in roll and pitch tilts a map differently at each place. Each session sees another side, 2 cm thick.
+    whole, pose, middle = chair(), yaw_pose(yaw_rad, (6.0, 2.0, 0.0)), np.array([[0.25, 0.25, 0.475]])
+    front, back = whole[whole[:, 1] < 0.3], whole[whole[:, 1] > 0.2]
+    start = leaning(front, lean_deg, 20.0)
+    end = transform(pose, leaning(back, lean_deg, 160.0))
+    (move,) = moves([noisy(start, "a", 0.02)], [noisy(end, "b", 0.02)])
+    went = transform(pose, leaning(middle, lean_deg, 160.0)) - leaning(middle, lean_deg, 20.0)
+    np.testing.assert_allclose(move.displacement_map, went[0], atol=0.12)
+    # a barrel that leans is no chair
+    there = transform(pose, leaning(barrel(), lean_deg, 160.0))
+    assert moves([noisy(start, "a", 0.02)], [noisy(there, "b", 0.02)]) == []
+
+
+def test_an_object_of_which_one_session_saw_a_part_is_the_whole_one() -> None:
+    tall = box((0.5, 0.4, 1.3), "lrfb")
+    lower = tall[tall[:, 2] < 0.7]  # something hides the rest
+    for ends in ((lower, tall), (tall, lower)):
+        assert len(moves([noisy(ends[0], "a")], [noisy(shifted(ends[1], 8.0), "b")])) == 1
+    # half as much is too little, and a lower box is another object: its lid is where the tall one has none
+    small = tall[tall[:, 2] < 0.35]
+    assert moves([noisy(tall, "a")], [noisy(shifted(small, 8.0), "b")]) == []
+    assert moves([noisy(tall, "a")], [noisy(shifted(box((0.5, 0.4, 0.5), "lrfb"), 8.0), "b")]) == []
