@@ -22,7 +22,7 @@ ABSENT = "absent"
 # Optional dependency of pyproject.toml -> the module that it installs.
 _EXTRAS = {
     "m3c2": "py4dgeo", "dufomap": "dufomap", "octomap": "pyoctomap", "kiss": "kiss_matcher", "odometry": "kiss_icp",
-    "ouster": "ouster", "formats": "pypcd4", "rerun": "rerun",
+    "ouster": "ouster", "formats": "pypcd4", "rerun": "rerun", "gpu": "warp",
 }  # fmt: skip
 
 

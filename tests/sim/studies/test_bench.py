@@ -28,7 +28,7 @@ def test_every_row_has_its_rival_and_its_target(site: BenchSite) -> None:
         "casting-bare": pytest.approx(1 / 1.2),
         "casting-two-threads": 1.7,
     }
-    assert {"session", "session-19-sub-rays"} == named.keys() - found.keys()
+    assert {"session", "session-19-sub-rays", "session-19-sub-rays-gpu"} == named.keys() - found.keys()
     n_mrays = site.sensor.width * site.sensor.height / 1e6
     for name, contest in found.items():
         if name == "world":
