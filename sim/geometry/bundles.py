@@ -27,7 +27,7 @@ class Bundle:
     def lengths(self) -> Float32Array:
         """(n,) length of each ray's direction before it is made a unit vector."""
         squares = (self.places * self.places).sum(axis=1)
-        return np.sqrt(1.0 + squares * self.slope**2).astype(np.float32)
+        return np.asarray(np.sqrt(1.0 + squares * self.slope**2), dtype=np.float32)
 
 
 def make_bundle_rays(

@@ -4,8 +4,8 @@ No product is fused with a sum (`fuse_fp`), so both devices round alike. The mes
 distance and cosine follow in float64 from the plane of that face.
 """
 
-# Warp reads the annotations of a kernel when it is decorated: they must be objects, not strings.
-# mypy: disable-error-code="misc,no-untyped-call"
+# Warp reads the annotations of a kernel when it is decorated: they must be objects, not strings, and are no types.
+# mypy: ignore-errors
 import warp as wp
 
 wp.set_module_options({"fuse_fp": False, "enable_backward": False})

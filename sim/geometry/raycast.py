@@ -64,8 +64,8 @@ class RayCaster(ABC):
         """
         # The rays of a beam are cast one after another: they meet the same triangles, which takes a quarter less time.
         hits = self.cast_local(*make_bundle_rays(origins, directions, bundle, self.centre_m))
-        ranges_m, ids, cosines = (np.ascontiguousarray(each.reshape(-1, len(bundle.places)).T) for each in hits)
-        return ranges_m, ids, cosines
+        ranges_m, ids, cosines = (each.reshape(-1, len(bundle.places)).T for each in hits)
+        return np.ascontiguousarray(ranges_m), np.ascontiguousarray(ids), np.ascontiguousarray(cosines)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -131,8 +131,9 @@ def spread_echo(
 
         places, weights = sub_ray_pattern(sub_rays)
         told = cast(Any, caster), reflectivity, rays, beam_origin_m, owners, beam_bundle(places), weights, PULSE_M
-        (*light, share), names = blend_on_device(*told)
-        return Echo(*light, *names, share)
+        light, (geom, owner) = blend_on_device(*told)
+        range_m, photons, cosine, true_range_m, share = light
+        return Echo(range_m, photons, cosine, true_range_m, geom, owner, share)
     hits = cast_beams(caster, reflectivity, rays, beam_origin_m, sub_rays)
     return blend_beams(hits, owners, rays.directions.shape[:2])
 

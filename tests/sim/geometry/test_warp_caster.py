@@ -21,7 +21,7 @@ if importlib.util.find_spec("warp") is None:
 
 from sim.geometry.warp_caster import WarpCaster
 
-N_COLUMNS = 200  # no multiple of the columns that Embree's caster takes at a time
+STEP = 3  # 171 columns: no multiple of the columns that Embree's caster takes at a time
 FAR_M = np.array([210.0, -35.0, 4.0])  # the scene lies far from the origin
 
 
@@ -56,10 +56,10 @@ def warp(meshes: list[Mesh], embree: Caster) -> WarpCaster:
 
 @pytest.fixture(scope="module")
 def rays(sensor: SensorMetadata) -> Rays:
-    """The first columns of a revolution of a sensor that moves and turns."""
+    """Every third column of a revolution of a sensor that moves and turns."""
     poses = np.stack([stand(0.001 * t, (0.001 * t, 0.2, 0.1)) for t in range(sensor.width)])
     whole = revolution_rays(sensor, poses)
-    return Rays(whole.origins[:N_COLUMNS], whole.directions[:N_COLUMNS])
+    return Rays(whole.origins[::STEP].copy(), whole.directions[::STEP].copy())
 
 
 def require_same(

@@ -13,7 +13,7 @@ from cdpipe.core import plugins
 from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.io.session import read_session
 from scenarios.library import load_scenario
-from scenarios.schema import Prop, Scenario, Sensor, Simulation
+from scenarios.schema import Platform, Prop, Scenario, Sensor, Simulation
 from sim.session import simulate
 from sim.session.simulate import simulate_in_memory, simulate_pair
 
@@ -51,8 +51,9 @@ def test_the_sessions_of_both_backends_differ_by_rounding_alone(scenario: Scenar
 @needs_warp
 @quiet
 def test_a_session_names_what_cast_it_and_keeps_its_bytes(scenario: Scenario, tmp_path: Path) -> None:
+    lean = on_warp(scenario).model_copy(update={"platform": Platform(scan_spacing_m=6.0)})
     for name in ("one", "two"):
-        simulate_pair(on_warp(scenario), SEED, tmp_path / name)
+        simulate_pair(lean, SEED, tmp_path / name)
     told = read_session(tmp_path / "one" / "before").provenance["casting"]
     assert told.startswith(f"warp-lang {plugins.extra_version('warp-lang')} on ")
     files = [path.relative_to(tmp_path / "one") for path in (tmp_path / "one").rglob("*") if path.is_file()]
@@ -69,8 +70,8 @@ def test_a_session_of_embree_names_nothing_and_its_scenario_says_no_backend(scen
 @needs_warp
 @quiet
 def test_movers_are_met_before_what_warp_casts() -> None:
-    settings = ["sensor.mode=512x10", "sensor.sub_rays=7", "platform.scan_spacing_m=4"]
-    scenario = load_scenario("moving/person", SEED, settings)
+    settings = ["sensor.mode=512x10", "sensor.sub_rays=7", "platform.scan_spacing_m=6"]
+    scenario = load_scenario("dynamic/narrow", SEED, settings)
     theirs, ours = (simulate_in_memory(each, SEED) for each in (scenario, on_warp(scenario)))
     for name in ("before", "after"):
         assert (ours.sessions[name].instance != theirs.sessions[name].instance).mean() < 1e-4
