@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from functools import cache
 from threading import Lock
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,13 @@ def start_device() -> str:
     wp.config.log_level = wp.LOG_ERROR
     wp.init()
     return "cuda:0" if wp.is_cuda_available() else "cpu"
+
+
+@cache
+def load_kernels(module: ModuleType, device: str) -> None:
+    """Compile the kernels of a module for a device, or take them from Warp's cache; one thread at a time."""
+    with _LOCK:
+        wp.load_module(module, device=device)
 
 
 class WarpCaster(RayCaster):
@@ -57,13 +65,13 @@ class WarpCaster(RayCaster):
         firsts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
         faces = np.concatenate([mesh.faces + first for mesh, first in zip(meshes, firsts, strict=True)])
         owners = np.repeat(np.arange(len(meshes), dtype=np.int32), [len(mesh.faces) for mesh in meshes])
-        with _LOCK:  # kernels are compiled once
-            wp.load_module(kernels, device=self.device)
+        load_kernels(kernels, self.device)
+        with self.turn:
             # On both devices the same tree: of two faces that meet in an edge the same one is found.
             flat = self.put(faces.astype(np.int32).ravel(), wp.int32)
             self._mesh = wp.Mesh(self.put(points, wp.vec3), flat, bvh_constructor="sah")
-        self._target = kernels.Target()
-        self._target.mesh, self._target.geoms = self._mesh.id, self.put(owners, wp.int32)
+            self._target = kernels.Target()
+            self._target.mesh, self._target.geoms = self._mesh.id, self.put(owners, wp.int32)
 
     def cast_local(
         self, origins: Float32Array, directions: Float32Array

@@ -7,8 +7,8 @@ import warp as wp
 
 from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array
 from sim.geometry.bundles import Bundle
-from sim.geometry.warp_caster import WarpCaster
-from sim.sensor.kernels import blend, shine
+from sim.geometry.warp_caster import WarpCaster, load_kernels
+from sim.sensor import kernels
 from sim.sensor.rays import Rays
 
 
@@ -39,13 +39,14 @@ def blend_on_device(
     """
     width, height, _ = rays.directions.shape
     n_rays, n_beams = len(weights), width * height
+    load_kernels(kernels, caster.device)
     with caster.turn:
         hits = caster.keep_bundles(rays.origins, rays.directions, bundle)
         photons = wp.empty((n_rays, n_beams), dtype=wp.float32, device=caster.device)
         told = [caster.put(reflectivity, wp.float32), caster.put(weights.astype(np.float32), wp.float32), beam_origin_m]
-        wp.launch(shine, (n_rays, n_beams), inputs=[*told, *hits, photons], device=caster.device)
+        wp.launch(kernels.shine, (n_rays, n_beams), inputs=[*told, *hits, photons], device=caster.device)
         echo = wp.empty((5, n_beams), dtype=wp.float32, device=caster.device)
         names = wp.empty((2, n_beams), dtype=wp.int32, device=caster.device)
         told = [caster.put(owners, wp.int32), pulse_m, *hits, photons]
-        wp.launch(blend, n_beams, inputs=told, outputs=[echo, names], device=caster.device)
+        wp.launch(kernels.blend, n_beams, inputs=told, outputs=[echo, names], device=caster.device)
         return echo.numpy().reshape(5, width, height), names.numpy().reshape(2, width, height)
