@@ -32,7 +32,10 @@ def start_device() -> str:
 
 @cache
 def load_kernels(module: ModuleType, device: str) -> None:
-    """Compile the kernels of a module for a device, or take them from Warp's cache; one thread at a time."""
+    """Compile the kernels of a module for a device, or take them from Warp's cache; one thread at a time.
+
+    The cache is the folder `WARP_CACHE_PATH`, by default in the user's cache.
+    """
     with _LOCK:
         wp.load_module(module, device=device)
 
