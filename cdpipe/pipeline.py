@@ -23,6 +23,7 @@ from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors.describe import (
     describe_scans,
+    insert_rows,
     list_checkpoints,
     load_descriptors,
     save_descriptors,
@@ -38,6 +39,7 @@ from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.recorded_frames import regions_as_mapped, report_as_recorded
 from cdpipe.mapping.scanless import adapt_to_whole_maps
 from cdpipe.mapping.session_check import check_session, unit_hint
+from cdpipe.merge.candidates import first_keyframes
 from cdpipe.merge.coverage import measure_coverage
 from cdpipe.merge.merge import merge_maps, take_known_merge
 from cdpipe.methods.registry import list_extras, load_source
@@ -192,7 +194,8 @@ def map_pair(
         stored: Stored descriptors of each session, used if they have the keyframes of its map.
 
     Returns:
-        Both mapped sessions, and `t_descriptor_s` of all descriptors that were computed.
+        Both mapped sessions, and `t_descriptor_s` of all descriptors that were computed. With `merge.first_every` the
+        scans of the other keyframes are described if the merge asks for them, as a part of its time.
 
     Raises:
         InputError: A session or one of its scans cannot be used.
@@ -203,10 +206,15 @@ def map_pair(
         for each, thin_map in zip(stored, maps, strict=True)
     ]
 
+    every = config.described_every
+
     def keyframes(session: int, chosen: slice) -> DescriptorSet:
-        return describe_scans(
-            clear(sources[session], config.map), maps[session].keyframe_scans[chosen], config.descriptor
-        )
+        scans = maps[session].keyframe_scans[chosen]
+        source = clear(sources[session], config.map)
+        if every == 1:
+            return describe_scans(source, scans, config.descriptor)
+        rows = first_keyframes(len(scans), every, session == 1)
+        return insert_rows(describe_scans(source, scans[rows], config.descriptor), rows, scans)
 
     def surroundings(session: int, chosen: slice) -> Spheres:
         anchors = anchor_frames(maps[session], maps[session].keyframe_scans[chosen], config.sphere)
@@ -221,7 +229,22 @@ def map_pair(
         )
         before, after = (replace(a, spheres=b) for a, b in zip((before, after), spheres.value, strict=True))
         seconds["t_descriptor_s"] += spheres.seconds["t_descriptor_s"]
-    return Done((MappedSession(maps[0], before), MappedSession(maps[1], after)), seconds)
+    mapped = []
+    for session, described in enumerate((before, after)):
+        rest = None
+        if every > 1 and kept[session] is None:
+            rest = partial(_describe_rest, sources[session], described, session == 1, config)
+        mapped.append(MappedSession(maps[session], described, rest))
+    return Done((mapped[0], mapped[1]), seconds)
+
+
+def _describe_rest(source: ScanSource, first: DescriptorSet, is_after: bool, config: PipelineConfig) -> DescriptorSet:
+    """Return the descriptors of all keyframes of a session of which the first ones are described."""
+    scans = first.keyframe_scans
+    rows = np.setdiff1d(np.arange(len(scans)), first_keyframes(len(scans), config.described_every, is_after))
+    if not len(rows):
+        return first
+    return insert_rows(describe_scans(clear(source, config.map), scans[rows], config.descriptor), rows, scans, first)
 
 
 def map_sources(sources: Sequence[ScanSource], config: PipelineConfig, hooks: Hooks) -> tuple[PointMap, PointMap]:

@@ -20,6 +20,20 @@ FAMILIES = Path(__file__).parent / "families"
 # Groups of families of which each is another one, seed by seed, but for one effect of a mine.
 EFFECT_GROUPS = frozenset({"cross", "dust", "dynamic", "glare", "water"})
 
+_PROPS = {
+    "box": "a box of cardboard, or of steel where it is larger than 0.75 m",
+    "crate": "a slatted wooden crate on skids, with gaps between its boards",
+    "chair": "a visitor's chair: tubular legs, a seat and a back rest",
+    "trolley": "an upright sack truck with two wheels",
+    "barrel": "a steel drum with rolling rings",
+    "cone": "a traffic cone with reflective bands",
+    "railing": "posts at most 1.5 m apart with three rails and a toe board",
+    "pallet": "a EUR pallet, or a stack of as many as the height holds",
+    "rock": "an angular fragment of rock",
+    "vehicle": "a parked pick-up truck",
+    "muck_pile": "blasted rock at the angle of repose, which a loader may take a share of",
+}
+
 
 def scenario_names() -> list[str]:
     """Return the names of the scenarios that come with the package or lie on the search path, e.g. `paper/site1`."""
@@ -29,6 +43,20 @@ def scenario_names() -> list[str]:
 def prop_names() -> list[str]:
     """Return the kinds of prop that a scenario may name beside `mesh`: ours, then those on the search path."""
     return [*(kind for kind in PROP_KINDS if kind != "mesh"), *sorted(prop_files())]
+
+
+def describe_prop(name: str) -> str:
+    """Return what a kind of prop is, in one line.
+
+    Raises:
+        ScenarioError: The file of a kind on the search path cannot be read.
+    """
+    if name in _PROPS:
+        return _PROPS[name]
+    path = prop_files()[name]
+    found = read_yaml(path).value
+    mesh = found.get("mesh") if isinstance(found, dict) else None
+    return f"the mesh {mesh.get('path') if isinstance(mesh, dict) else mesh} of {path}"
 
 
 def family_files() -> dict[str, Path]:

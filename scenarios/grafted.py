@@ -29,7 +29,7 @@ class Recording(Settings):
     before_T_after: FileName | None = None  # of two recordings: file of their merge; left out: found by `tunnelcd`
     trajectories: Annotated[tuple[FileName, ...], Field(max_length=2)] = ()  # poses of each recording
     metadata: Annotated[tuple[FileName, ...], Field(max_length=2)] = ()  # sensor of each PCAP
-    odometry: Literal["kiss-icp"] | None = None  # estimates the poses
+    odometry: Literal["kiss-icp", "genz-icp"] | None = None  # estimates the poses
     format: str | None = None
     topics: tuple[str, ...] = ()  # of a bag
     deskew: bool = True

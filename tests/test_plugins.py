@@ -59,6 +59,9 @@ def test_plugins_are_listed(installed: dict[str, str]) -> None:
     listed = tunnelcd(installed, "list").stdout.split()
     assert listed.count("higher") == 2  # the method and its preset
     assert {"from_folder", "plugged", "largest"} <= set(listed)
+    for kind, name in (("methods", "higher"), ("metrics", "largest")):
+        lines = tunnelcd(installed, "list", kind).stdout.splitlines()
+        assert any(line.split()[0] == name and len(line.split()) > 4 for line in lines)  # the line of its docstring
 
 
 def test_plugins_run_in_a_plan_and_are_scored(installed: dict[str, str]) -> None:

@@ -85,9 +85,6 @@ def test_the_lines_of_python_simulate_detect_score_and_plot(
 
 
 def test_a_method_of_ones_own_is_benchmarked(recipe: Callable[[str], None], monkeypatch: pytest.MonkeyPatch) -> None:
-    page = (ROOT / "eval" / "scoring" / "ANSWERS.md").read_text()
-    (script,) = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
-    Path("predict.py").write_text(script)
     monkeypatch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)
     recipe("benchmark")
     rows = pd.read_csv("bench/results.csv").set_index(["scenario", "variant"])

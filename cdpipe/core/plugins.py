@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 from collections.abc import Callable
 from functools import cache
@@ -22,6 +23,7 @@ ABSENT = "absent"
 # Optional dependency of pyproject.toml -> the module that it installs.
 _EXTRAS = {
     "m3c2": "py4dgeo", "dufomap": "dufomap", "octomap": "pyoctomap", "kiss": "kiss_matcher", "odometry": "kiss_icp",
+    "genz": "genz_icp",
     "ouster": "ouster", "formats": "pypcd4", "rerun": "rerun", "gpu": "warp",
 }  # fmt: skip
 
@@ -77,6 +79,25 @@ def load_entry_point(group: str, name: str) -> Any:
         return entry.load()
     except (ImportError, AttributeError) as error:
         raise InputError(f"{group}: {name!r} = {entry.value} cannot be imported: {error}") from error
+
+
+def describe_entry_point(group: str, name: str) -> str:
+    """Return the first line of the docstring of the class or function behind an entry point, else of its module.
+
+    The object is not imported: its package may be slow, or need what is not installed. "" where there is no docstring.
+    """
+    entry = entry_points(group)[name]
+    try:
+        spec = find_spec(entry.module)
+        tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else "")
+    except (ImportError, OSError, ValueError, SyntaxError):
+        return ""
+    own = [
+        node
+        for node in tree.body
+        if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == entry.attr.partition(".")[0]
+    ]
+    return next((line for node in (*own, tree) if (line := (ast.get_docstring(node) or "").partition("\n")[0])), "")
 
 
 def search_folders(kind: str) -> tuple[Path, ...]:

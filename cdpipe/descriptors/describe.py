@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,9 @@ from cdpipe.descriptors.weights_file import checkpoint_bytes, digest, read_weigh
 from cdpipe.model.config import DescriptorConfig, MapConfig, PipelineConfig, SphereConfig
 from cdpipe.model.types import DescriptorSet, PosedScan, ScanSource
 
-_BATCH = 32
+# Scans described at a time; the features of more do not fit the cache. The results are those of batches of twice as
+# many, to the byte, if what is left over from these is one batch.
+_BATCH = 16
 _SHIPPED = SphereConfig()
 _FILE = {
     "checkpoint": ArraySpec("", "str"),
@@ -60,13 +63,37 @@ def describe_scans(source: ScanSource, keyframe_scans: Int64Array, config: Descr
     Raises:
         InputError: The file of weights cannot be used.
     """
-    parts = []
-    for start in range(0, len(keyframe_scans), _BATCH):
-        batch = keyframe_scans[start : start + _BATCH].tolist()
-        parts.append(_describe((source.scan(index).points_sensor for index in batch), config))
+    n_in_batches = len(keyframe_scans) // (2 * _BATCH) * 2 * _BATCH
+    parts = [
+        _describe((source.scan(index).points_sensor for index in batch.tolist()), config)
+        for batch in np.split(keyframe_scans, [*range(_BATCH, n_in_batches + 1, _BATCH)])
+        if len(batch)
+    ]
     q = np.concatenate([part[0] for part in parts])
     w = np.concatenate([part[1] for part in parts])
     return DescriptorSet(q, w, keyframe_scans, config.method, checkpoint_digest(config))
+
+
+def insert_rows(
+    part: DescriptorSet, rows: Int64Array, keyframe_scans: Int64Array, known: DescriptorSet | None = None
+) -> DescriptorSet:
+    """Return descriptors of all K keyframes from those of some; the others keep the known ones, or have zeros.
+
+    Args:
+        part: Descriptors of R of the keyframes, without spheres.
+        rows: (R,) which ones they are.
+        keyframe_scans: (K,) scans of all keyframes.
+        known: Descriptors of all keyframes.
+    """
+    q, w = (_insert(len(keyframe_scans), rows, getattr(part, n), getattr(known, n, None)) for n in ("q", "w"))
+    return replace(part, q=q, w=w, keyframe_scans=keyframe_scans, spheres=None if known is None else known.spheres)
+
+
+def _insert(n: int, rows: Int64Array, part: Float32Array, known: Float32Array | None) -> Float32Array:
+    """Return the (n, D) known vectors, or zeros, with the (R, D) `part` in the given rows."""
+    vectors = np.zeros((n, part.shape[1]), np.float32) if known is None else known.copy()
+    vectors[rows] = part
+    return vectors
 
 
 def save_descriptors(

@@ -1,10 +1,13 @@
-"""KISS-ICP odometry (arXiv 2209.15397) from the revolutions of a session."""
+"""Odometry from the revolutions of a session: KISS-ICP (arXiv 2209.15397), or GenZ-ICP (`genz`)."""
 
-# ruff: noqa: PLC0415 - KISS-ICP is an extra, and everybody else must be able to import this
+# ruff: noqa: PLC0415 - both are extras, and everybody else must be able to import this
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -13,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, invert, travelled_m
+from cdpipe.core.isolation import run_isolated
 from cdpipe.core.motion import Motion, make_motion, rotation_matrices
 from cdpipe.sensor.ouster import SensorMetadata
 
@@ -24,8 +28,22 @@ _FIRST_THRESHOLD_M = 2.0
 _LEAST_MOTION_M = 0.1
 _MAX_ITERATIONS = 500
 _CONVERGED = 1e-4
-# Returns the points (N, 3) of a scan, deskewed at a velocity (6,): metres and radians a second.
-_Frame = Callable[[Float64Array], Float64Array]
+# Name of an odometry -> the extra that installs it.
+ODOMETRIES = {"kiss-icp": "odometry", "genz-icp": "genz"}
+_GENZ = "genz-icp"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Frame:
+    """A scan before it is deskewed.
+
+    Attributes:
+        deskew: Returns its points (N, 3), deskewed at a velocity (6,): metres and radians a second.
+        flatten: Returns its points (N, 3), metres, and the time (N,) of each after the stamp, seconds; (0,) for none.
+    """
+
+    deskew: Callable[[Float64Array], Float64Array]
+    flatten: Callable[[], tuple[Float64Array, Float64Array]]
 
 
 def estimate_motion(
@@ -34,10 +52,11 @@ def estimate_motion(
     revolution_s: Float64Array,
     column_s: Float64Array,
     odom_T_first: Float64Array,
+    odometry: str = "kiss-icp",
 ) -> Motion:
-    """Return the motion that KISS-ICP estimates, with one sample at the middle column of each revolution.
+    """Return the motion that an odometry estimates, with one sample at the middle column of each revolution.
 
-    Each revolution is first deskewed to its middle column at the velocity of the preceding step. KISS-ICP's own
+    Each revolution is first deskewed to its middle column at the velocity of the preceding step. The odometry's own
     deskewing is off, because it assumes revolutions without gaps. A single revolution gives a motion at rest.
 
     Args:
@@ -45,13 +64,14 @@ def estimate_motion(
         sensor: Beam table.
         revolution_s: (S,) time of each middle column.
         column_s: (W,) time of each column after the middle one.
-        odom_T_first: (4, 4) pose of the first revolution, the origin of KISS-ICP's frame.
+        odom_T_first: (4, 4) pose of the first revolution, the origin of the estimated frame.
+        odometry: One of `ODOMETRIES`.
 
     Raises:
         InputError: A pose is not finite.
     """
     frames = (_columns_frame(sensor.project(range_mm / 1000.0), range_mm > 0, column_s) for range_mm in range_images)
-    poses = _register(frames, revolution_s, "revolution")
+    poses = _register(frames, revolution_s, "revolution", odometry)
     odom_T_sensor = odom_T_first @ poses
     if len(odom_T_sensor) == 1:
         odom_T_sensor = np.repeat(odom_T_sensor, 2, axis=0)
@@ -61,41 +81,74 @@ def estimate_motion(
 
 
 def estimate_cloud_motion(
-    clouds: Iterable[tuple[Float64Array, Float64Array | None]], stamps_s: Float64Array
+    clouds: Iterable[tuple[Float64Array, Float64Array | None]], stamps_s: Float64Array, odometry: str = "kiss-icp"
 ) -> Float64Array:
-    """Return the poses (S, 4, 4) that KISS-ICP estimates for clouds of any sensor; the first is the identity.
+    """Return the poses (S, 4, 4) that an odometry estimates for clouds of any sensor; the first is the identity.
 
     Args:
         clouds: For each scan its points (N, 3), metres, and the time (N,) of each after the stamp, seconds; None where
             they are deskewed or have no times.
         stamps_s: (S,) rising time of each scan.
+        odometry: One of `ODOMETRIES`.
 
     Raises:
         InputError: A pose is not finite.
     """
-    return _register((_cloud_frame(points, time_s) for points, time_s in clouds), stamps_s, "scan")
+    return _register((cloud_frame(points, time_s) for points, time_s in clouds), stamps_s, "scan", odometry)
 
 
 def _columns_frame(points: Float64Array, is_hit: BoolArray, column_s: Float64Array) -> _Frame:
-    return lambda twist: deskew_at_constant_velocity(points, twist[:3], twist[3:], column_s)[is_hit]
+    return _Frame(
+        lambda twist: deskew_at_constant_velocity(points, twist[:3], twist[3:], column_s)[is_hit],
+        lambda: (points[is_hit], np.broadcast_to(column_s, is_hit.shape)[is_hit]),
+    )
 
 
-def _cloud_frame(points: Float64Array, time_s: Float64Array | None) -> _Frame:
+def cloud_frame(points: Float64Array, time_s: Float64Array | None) -> _Frame:
+    """Return the frame of (N, 3) points with the time (N,) of each after the stamp, or deskewed ones without times."""
     if time_s is None:
-        return lambda twist: points
-    return lambda twist: deskew_at_constant_velocity(points[None], twist[:3], twist[3:], time_s)[0]
+        return _Frame(lambda twist: points, lambda: (points, np.zeros(0)))
+    return _Frame(
+        lambda twist: deskew_at_constant_velocity(points[None], twist[:3], twist[3:], time_s)[0],
+        lambda: (points, time_s),
+    )
 
 
-def _register(frames: Iterable[_Frame], stamps_s: Float64Array, what: str) -> Float64Array:
-    """Return the pose (S, 4, 4) of each frame, which is deskewed at the velocity (6,) of the preceding step."""
-    icp = _kiss_icp()
+def _register(frames: Iterable[_Frame], stamps_s: Float64Array, what: str, odometry: str) -> Float64Array:
+    """Return the pose (S, 4, 4) of each frame."""
+    if odometry != _GENZ:
+        return register_frames(_kiss_icp(), "KISS-ICP", frames, stamps_s, what)
+    from cdpipe.mapping.genz import register_stored, stored_scan
+
+    with TemporaryDirectory(prefix="tunnelcd-") as folder:
+        for number, frame in enumerate(frames):
+            points, time_s = frame.flatten()
+            np.savez(stored_scan(Path(folder), number), allow_pickle=False, points=points, time_s=time_s)
+        return np.asarray(
+            run_isolated(register_stored, {"folder": folder, "stamps_s": stamps_s.tolist(), "what": what})
+        )
+
+
+def register_frames(icp: Any, name: str, frames: Iterable[_Frame], stamps_s: Float64Array, what: str) -> Float64Array:
+    """Return the pose (S, 4, 4) of each frame, which is deskewed at the velocity (6,) of the preceding step.
+
+    Args:
+        icp: The odometry, which has `register_frame` and `last_pose`.
+        name: What it is called.
+        frames: The scans in order.
+        stamps_s: (S,) rising time of each.
+        what: What a scan is called.
+
+    Raises:
+        InputError: A pose is not finite.
+    """
     poses = np.tile(np.eye(4), (len(stamps_s), 1, 1))
     twist = np.zeros(6)
     for number, frame in enumerate(frames):
-        icp.register_frame(np.ascontiguousarray(frame(twist)), np.zeros(0))
+        icp.register_frame(np.ascontiguousarray(frame.deskew(twist)), np.zeros(0))
         poses[number] = icp.last_pose
         if not np.isfinite(poses[number]).all():
-            raise InputError(f"KISS-ICP has no finite pose for {what} {number}, {stamps_s[number]:.1f} s on the way")
+            raise InputError(f"{name} has no finite pose for {what} {number}, {stamps_s[number]:.1f} s on the way")
         if number + 1 < len(stamps_s) and number > 0:
             elapsed_s = stamps_s[number] - stamps_s[number - 1]
             delta = invert(poses[number - 1]) @ poses[number]

@@ -24,6 +24,8 @@ from cdpipe.model.types import DescriptorSet, MappedSession
 _MAX_QUERIES = 100
 _NEAREST = 2
 _N_YAWS = 2
+# Keyframes of a short session that are compared first.
+_FEWEST = 10
 # Yaws to try without orientation vectors: GICP converges from about 60 degrees, so quarter turns cover the circle.
 _BLIND_YAWS_RAD = np.array([0.0, np.pi, np.pi / 2, -np.pi / 2])
 # Tolerance of the distance between two pairs: keyframes of one place are up to 2 m apart; drift grows with distance.
@@ -55,7 +57,8 @@ class Candidate:
 
 def find_closest_pair(before: MappedSession, after: MappedSession) -> list[Candidate]:
     """Return FRAME's only candidate, the closest of all descriptor pairs; empty if a session has no descriptor."""
-    pairs = _match_descriptors(before.descriptors, after.descriptors, len(after.descriptors.q), nearest=1, n_yaws=1)
+    rows = np.arange(len(before.descriptors.q)), np.arange(len(after.descriptors.q))
+    pairs = _match_descriptors(before.descriptors, after.descriptors, rows, nearest=1, n_yaws=1)
     if len(pairs.i) == 0:
         return []
     best = int(np.argmin(pairs.distances))
@@ -65,13 +68,51 @@ def find_closest_pair(before: MappedSession, after: MappedSession) -> list[Candi
     return [Candidate(i, j, float(pairs.distances[best]), guess)]
 
 
-def find_candidates(before: MappedSession, after: MappedSession, config: MergeConfig) -> list[Candidate]:
+def first_keyframes(n_keyframes: int, every: int, is_after: bool) -> Int64Array:
+    """Return the keyframes of a session that are compared first: indices, rising.
+
+    They are every `every`-th of a before session, so that each place has one nearby, and half as many of an after
+    session, which only have to be enough for a vote; 100 of it at most, because no more are queried. Short sessions
+    have ten, if they have ten keyframes. With `every` = 1 they are all that are ever compared.
+
+    Args:
+        n_keyframes: Number of keyframes of the session.
+        every: `merge.first_every`.
+        is_after: Whether the session is the after session.
+    """
+    if is_after and every > 1:
+        every *= 2
+    chosen = np.arange(0, n_keyframes, max(1, min(every, n_keyframes // _FEWEST)))
+    return chosen[_spread(len(chosen), _MAX_QUERIES)] if is_after else chosen
+
+
+def list_tries(before: MappedSession, after: MappedSession, config: MergeConfig) -> tuple[int, ...]:
+    """Return every which keyframe to compare, one try after the other: all of short sessions at once."""
+    n_before, n_after = len(before.descriptors.q), len(after.descriptors.q)
+
+    def count(every: int) -> tuple[int, int]:
+        return len(first_keyframes(n_before, every, False)), len(first_keyframes(n_after, every, True))
+
+    return (1,) if count(config.first_every) == count(1) else (config.first_every, 1)
+
+
+def find_candidates(
+    before: MappedSession, after: MappedSession, config: MergeConfig, every: int = 1
+) -> list[Candidate]:
     """Return up to `n_candidates` pairs in falling order of votes, each with a different motion.
 
     The initial guess of a pair is the motion that best fits all pairs that agree with it. Pairs that agree with a
     chosen pair, or have the same motion, are left out.
+
+    Args:
+        before: The before session.
+        after: The after session.
+        config: Settings of the merge.
+        every: Only the `first_keyframes` of both sessions are compared; 1: all of them.
     """
-    pairs = _match_descriptors(before.descriptors, after.descriptors, _MAX_QUERIES, _NEAREST, _N_YAWS)
+    described = before.descriptors, after.descriptors
+    rows = first_keyframes(len(described[0].q), every, False), first_keyframes(len(described[1].q), every, True)
+    pairs = _match_descriptors(*described, rows, _NEAREST, _N_YAWS)
     before_poses, after_poses = _poses(before)[pairs.i], _poses(after)[pairs.j]
     agrees, votes = count_votes(before_poses, after_poses, pairs.yaws_rad)
     is_open = np.ones(len(pairs.i), dtype=np.bool_)
@@ -137,15 +178,15 @@ class _Pairs:
 
 
 def _match_descriptors(
-    before: DescriptorSet, after: DescriptorSet, n_queries: int, nearest: int, n_yaws: int
+    before: DescriptorSet, after: DescriptorSet, rows: tuple[Int64Array, Int64Array], nearest: int, n_yaws: int
 ) -> _Pairs:
-    n_before, n_after = len(before.q), len(after.q)
-    if n_before == 0 or n_after == 0:
+    """Pair each of some after keyframes with its nearest ones of some before keyframes; `rows` are the indices."""
+    searched, queried = rows
+    if len(searched) == 0 or len(queried) == 0:
         return _Pairs(*(np.zeros(0, dtype=np.int64),) * 2, *(np.zeros(0),) * 2)
-    queried = np.unique(np.linspace(0, n_after - 1, min(n_after, n_queries)).round().astype(np.int64))
-    ranks = [*range(1, min(nearest, n_before) + 1)]
-    found = cKDTree(before.q).query(after.q[queried], k=ranks)
-    distances, i = np.asarray(found[0]).ravel(), np.asarray(found[1], dtype=np.int64).ravel()
+    ranks = [*range(1, min(nearest, len(searched)) + 1)]
+    found = cKDTree(before.q[searched]).query(after.q[queried], k=ranks)
+    distances, i = np.asarray(found[0]).ravel(), searched[np.asarray(found[1], dtype=np.int64).ravel()]
     j = np.repeat(queried, len(ranks))
     if before.w is None or after.w is None:
         yaws_rad = np.repeat(_BLIND_YAWS_RAD[None], len(i), axis=0)
@@ -158,6 +199,11 @@ def _match_descriptors(
     is_there = ~np.isnan(yaws_rad.ravel())
     which = which[is_there]
     return _Pairs(i[which], j[which], distances[which], yaws_rad.ravel()[is_there])
+
+
+def _spread(n: int, most: int) -> Int64Array:
+    """Return up to `most` of the indices of n items, evenly spread."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
 
 
 def _fit_common_motion(

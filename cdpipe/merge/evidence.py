@@ -80,7 +80,8 @@ def measure_fit(
         centre_after: (3,) the place, after odom frame.
         radius_m: Radius of the sphere of before points, metres.
     """
-    fine = before.target
+    centre_before = transform(before_T_after, centre_after[None])[0]
+    fine, rows = before.target_near(centre_before, radius_m + _COUNTERPART_M)
     moved = transform(before_T_after, own)
     found, squared_m2 = fine.tree.batch_nearest_neighbor_search(moved)
     normals = fine.normals[found]
@@ -89,12 +90,11 @@ def measure_fit(
     jacobian = plane_jacobian(own[is_seen] - centre_after, normals[is_seen] @ before_T_after[:3, :3])
     information = jacobian.T @ jacobian
 
-    centre_before = transform(before_T_after, centre_after[None])[0]
     chosen = sample_evenly(before.columns.crop(centre_before, radius_m))
     theirs = transform(invert(before_T_after), before.points[chosen])
-    found, squared_m2 = after.tree.batch_nearest_neighbor_search(theirs)
-    turned = fine.normals[chosen] @ before_T_after[:3, :3]
-    backward_m = plane_distances(theirs, after.points[found], turned, np.asarray(squared_m2))
+    nearest, squared_m2 = after.nearest_near(centre_after, radius_m + _COUNTERPART_M, theirs)
+    turned = fine.normals[chosen if rows is None else np.searchsorted(rows, chosen)] @ before_T_after[:3, :3]
+    backward_m = plane_distances(theirs, nearest, turned, squared_m2)
     return SurfaceFit(forward_m, backward_m, information)
 
 

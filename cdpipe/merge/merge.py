@@ -17,7 +17,7 @@ import numpy as np
 
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, transform, travelled_m
 from cdpipe.mapping.recorded_frames import merge_as_mapped
-from cdpipe.merge.candidates import Candidate, find_candidates, find_closest_pair
+from cdpipe.merge.candidates import Candidate, find_candidates, find_closest_pair, list_tries
 from cdpipe.merge.evidence import SurfaceFit, explain_refusal, measure_fit, sample_evenly
 from cdpipe.merge.global_registration import is_kiss_matcher_installed, register_globally
 from cdpipe.merge.refine import refine
@@ -29,10 +29,11 @@ from cdpipe.merge.registration import (
     motion_between,
     register,
 )
+from cdpipe.merge.rings import explain_rings, measure_rings
 from cdpipe.merge.walk import Step, Walk, choose_evenly, is_shared, walk
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import MergeConfig
-from cdpipe.model.types import MappedSession, MergedMaps
+from cdpipe.model.types import MappedSession, MergedMaps, PointMap
 
 # Number of spheres along the path that measure the evidence, and their radius: walls 5 m away must be inside.
 _CHECKS = 8
@@ -56,6 +57,8 @@ _UPRIGHT = 0.966
 # Largest displacement of a place by which a checked refinement may change a known alignment: a constant, or a share of
 # the path, which is what odometry drifts.
 _KNOWN_M, _KNOWN_SHARE = 1.0, 0.01
+# A path from which on its map is indexed around the places of the walk alone: these are half of it.
+_LONG_M = 400.0
 # Longest correspondences of the walk, metres: above the drift between two stops, below the width of a narrow drift.
 _FIRST_TRY_M, _CHECK_REACH_M = 1.0, 1.5
 
@@ -76,8 +79,8 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     points within `inlier_m` of the other surface, and median distance, around the start), `hessian_ratio` (smallest to
     largest eigenvalue of the translation's Hessian, whole path), `agreement` (mean inlier share along the path),
     `distinctness` (residual of the best rival alignment divided by this one's; 10 without a rival),
-    `descriptor_distance`, `n_hypotheses` walked, `is_fallback`, and `kiss_matcher`: 1 if KISS-Matcher was asked, 0 if
-    it was wanted and is not installed.
+    `line_share` of a short path (`rings`), `descriptor_distance`, `n_hypotheses` walked, `is_fallback`, and
+    `kiss_matcher`: 1 if KISS-Matcher was asked, 0 if it was wanted and is not installed.
 
     Returns:
         The best hypothesis with the reason of a refusal; the identity if nothing could be registered.
@@ -86,17 +89,23 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
         none = {"t_index_s": 0.0, "t_merge_s": 0.0, "t_refine_s": 0.0}
         return MergedMaps(before.map, after.map, np.eye(4), {"n_hypotheses": 0.0}, False, _TOO_FEW, seconds=none)
     start = perf_counter()
-    maps = (IndexedMap(before.map, config, is_target=True), IndexedMap(after.map, config, is_target=False))
+    is_local = [config.first_every > 1 and _path_m(each.map) > _LONG_M for each in (before, after)]
+    maps = (
+        IndexedMap(before.map, config, is_target=True, is_local=is_local[0]),
+        IndexedMap(after.map, config, is_target=False, is_local=is_local[1]),
+    )
     indexed = perf_counter()
     best, n_hypotheses, asks_kiss_matcher = _find_hypothesis(before, after, maps, config)
     evidence: dict[str, float] = {"n_hypotheses": float(n_hypotheses)}
     if asks_kiss_matcher:
         evidence["kiss_matcher"] = float(is_kiss_matcher_installed())
-    seconds = {"t_index_s": indexed - start, "t_merge_s": perf_counter() - indexed, "t_refine_s": 0.0}
+    local_s = maps[0].local_s + maps[1].local_s  # indexing, too, which a robot does while it maps
+    merge_s = perf_counter() - indexed - local_s
+    seconds = {"t_index_s": indexed - start + local_s, "t_merge_s": merge_s, "t_refine_s": 0.0}
     if best is None:
         return MergedMaps(before.map, after.map, np.eye(4), evidence, False, _TOO_FEW, seconds=seconds)
-    evidence = {**best.evidence, **evidence}
-    reason = "" if config.accept_all else explain_refusal(evidence, config)
+    evidence = {**best.evidence, **evidence, **measure_rings(before, after, config.seen_within_m)}
+    reason = "" if config.accept_all else explain_refusal(evidence, config) or explain_rings(evidence)
     if reason and config.fallback and not is_kiss_matcher_installed():
         reason += " (KISS-Matcher could not be asked: pip install 'tunnelcd[kiss]')"
     before_T_after, local = best.before_T_after, None
@@ -117,7 +126,8 @@ def take_known_merge(
     """Return both maps with an alignment that the user knows; no gate is asked.
 
     Evidence: `is_known` is 1; the other measurements are those of a walk that starts at the known alignment. With
-    `config.refine` the alignment is refined along the path, and stays as it is where the refinement does not fit. A
+    `config.refine` the alignment is refined along the path, and stays as it is where the refinement does not fit, or
+    where both maps are rings that lie apart (`rings`). A
     checked refinement moves no place by more than 1 m or 1 % of the after path, if that is more.
 
     Args:
@@ -140,17 +150,19 @@ def take_known_merge(
     indexed = perf_counter()
     distances_m, _ = maps[0].path.query(transform(before_T_after, maps[1].positions))
     found = _judge(_Start(int(np.argmin(distances_m)), before_T_after, known), maps, config)
-    evidence, local, refined = dict(found.evidence), known_local, before_T_after
+    evidence = {**found.evidence, **measure_rings(before, after, config.seen_within_m)}
+    local, refined = known_local, before_T_after
     walked = perf_counter()
     within_m = np.inf
     if config.refine == "checked":
         within_m = max(_KNOWN_M, _KNOWN_SHARE * float(travelled_m(after.map.odom_T_keyframe)[-1]))
-    if config.refine != "none" and "both_ways_m" in evidence:
+    has_refinement = config.refine != "none" and not explain_rings(evidence)
+    if has_refinement and "both_ways_m" in evidence:
         place = maps[1].positions[found.walk.keyframes[0]]
         is_near = motion_between(found.before_T_after, before_T_after, place)[0] <= within_m
         if is_near and not explain_refusal(evidence, config):
             local, refined = None, found.before_T_after
-    elif config.refine != "none":
+    elif has_refinement:
         del maps
         fitted, measured = refine(before.map, after.map, found.walk, before_T_after, config, within_m)
         evidence |= measured
@@ -159,9 +171,13 @@ def take_known_merge(
     seconds = {
         "t_index_s": indexed - start,
         "t_merge_s": walked - indexed,
-        "t_refine_s": perf_counter() - walked if config.refine != "none" else 0.0,
+        "t_refine_s": perf_counter() - walked if has_refinement else 0.0,
     }
     return replace(merged, before_T_after=refined, evidence=evidence, local=local, seconds=seconds)
+
+
+def _path_m(point_map: PointMap) -> float:
+    return float(travelled_m(point_map.odom_T_keyframe)[-1]) if len(point_map.keyframe_scans) else 0.0
 
 
 def _have_points(before: MappedSession, after: MappedSession, config: MergeConfig) -> bool:
@@ -180,11 +196,16 @@ def _find_hypothesis(
     best: _Hypothesis | None = None
     n_tried = 0
     if config.method == "voting":
-        starts = _rank_starts(find_candidates(before, after, config), maps, config)
-        best, n_tried = _choose_hypothesis(starts, maps, config)
-        is_accepted = best is not None and not explain_refusal(best.evidence, config)
-        if is_accepted or not (config.fallback and is_kiss_matcher_installed()):
-            return best, n_tried, config.fallback and not is_accepted
+        for every in list_tries(before, after, config):
+            if every == 1:
+                before, after = before.described(), after.described()
+            starts = _rank_starts(find_candidates(before, after, config, every), maps, config)
+            found, n_found = _choose_hypothesis(starts, maps, config)
+            best, n_tried = found or best, n_tried + n_found
+            if best is not None and not explain_refusal(best.evidence, config):
+                return best, n_tried, False
+        if not (config.fallback and is_kiss_matcher_installed()):
+            return best, n_tried, config.fallback
     other, n_other = _choose_hypothesis(_start_by_kiss_matcher(maps, config), maps, config)
     if other is not None and (best is None or not explain_refusal(other.evidence, config)):
         best = other
@@ -212,10 +233,11 @@ def _rank_starts(
         points = after.sphere(centre, config.sphere_radius_m)
         if len(points) < MIN_SPHERE_POINTS:
             continue
+        there = transform(candidate.before_T_after, centre[None])[0]
         pose = align_by_gicp(
             points,
             centre,
-            before.coarse_target,
+            before.coarse_target_near(there, config.sphere_radius_m + config.gicp_correspondence_m),
             candidate.before_T_after,
             config.gicp_correspondence_m,
             config.coarse_voxel_m,
@@ -385,7 +407,9 @@ def _register_start(
     pose = start.before_T_after
     points = after.sphere(centre, _CHECK_RADIUS_M)
     if config.method != "frame" and len(points) >= MIN_SPHERE_POINTS:
-        pose = align_by_gicp(points, centre, before.target, pose, config.vgicp_correspondence_m, config.voxel_m)
+        there = transform(pose, centre[None])[0]
+        target, _ = before.target_near(there, _CHECK_RADIUS_M + config.vgicp_correspondence_m)
+        pose = align_by_gicp(points, centre, target, pose, config.vgicp_correspondence_m, config.voxel_m)
     return pose, measure_fit(before, after, pose, sample_evenly(points), centre, _CHECK_RADIUS_M)
 
 

@@ -6,12 +6,26 @@ before map is indexed once, with normals and covariances, so a registration only
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
 import numpy as np
 import small_gicp
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, invert, make_pose, plane_jacobian, transform
+from cdpipe.core.geometry import (
+    BoolArray,
+    Float32Array,
+    Float64Array,
+    Int64Array,
+    invert,
+    make_pose,
+    plane_jacobian,
+    transform,
+)
 from cdpipe.core.grid_index import GridIndex, column_keys
 from cdpipe.core.voxel import cell_keys
 from cdpipe.model.config import MergeConfig
@@ -23,6 +37,10 @@ _NEIGHBOURS = 10
 # Scale of the robust weight: changed objects must not pull.
 _ROBUST_M = 0.1
 _PLANE_STEPS, _PLANE_CONVERGED, _DAMPING, _MIN_PAIRS = 8, 1e-3, 1e-3, 30
+# Points beyond an indexed place that the normals at its border are made of.
+_MARGIN_M = 2.0
+# How much wider than asked for a place is indexed: a registration moves it.
+_SLACK_M = 2.0
 # Correspondence distance over voxel size of VGICP.
 _VGICP_CELLS = 2.0
 
@@ -55,6 +73,9 @@ class IndexedMap:
     the time they were observed. A target is thinned to `merge.target_voxel_m` (reports/merge/notes). The (N,) points of
     the map that are held out are left out.
 
+    A map that `is_local` has trees, covariances and normals only around the places that were asked for, which is a
+    fraction of a long path. Results are those of the full index, but for points whose neighbours are metres away.
+
     Attributes:
         map: The map.
         points: (N, 3) the points in use, odom frame, metres.
@@ -62,7 +83,7 @@ class IndexedMap:
         columns: Grid index of the points, for cropping spheres.
         positions: (K, 3) keyframe positions, odom frame, metres.
         path: k-d tree of the positions of all scans.
-        tree: k-d tree of the points.
+        local_s: Seconds spent on places since the map was indexed.
     """
 
     def __init__(
@@ -72,6 +93,7 @@ class IndexedMap:
         is_target: bool,
         has_coarse_target: bool = True,
         is_held_out: BoolArray | None = None,
+        is_local: bool = False,
     ) -> None:
         self.map = point_map
         is_near = point_map.nearest_m <= config.seen_within_m
@@ -83,9 +105,13 @@ class IndexedMap:
         self.columns = GridIndex(self.points)
         self.positions = point_map.odom_T_keyframe[:, :3, 3]
         self.path = cKDTree(point_map.odom_T_sensor[:, :3, 3])
-        self._fine = Surface(self.points) if is_target else None
-        self._coarse = Surface(self.points, config.coarse_voxel_m) if is_target and has_coarse_target else None
-        self.tree = self._fine.tree if self._fine else small_gicp.KdTree(self.points)
+        self.local_s = 0.0
+        self._coarse_voxel_m, self._places = config.coarse_voxel_m, list[_Place]()
+        self._is_target, self._is_local = is_target, is_local
+        is_whole = is_target and not is_local
+        self._fine = Surface(self.points) if is_whole else None
+        self._coarse = Surface(self.points, config.coarse_voxel_m) if is_whole and has_coarse_target else None
+        self._tree = None if is_target or is_local else small_gicp.KdTree(self.points)
 
     @property
     def target(self) -> Surface:
@@ -101,9 +127,70 @@ class IndexedMap:
             raise ValueError("this map was not indexed as a target")
         return self._coarse
 
+    def target_near(self, centre: Float64Array, radius_m: float) -> tuple[Surface, Int64Array | None]:
+        """Return a registration target that holds the map within `radius_m` of `centre` (3,).
+
+        With it the index into `points` of each of its points, rising; None if it holds all of them.
+        """
+        if not self._is_local:
+            return self.target, None
+        place = self._find_place("fine", centre, radius_m, Surface)
+        return place.index, place.rows
+
+    def coarse_target_near(self, centre: Float64Array, radius_m: float) -> Surface:
+        """Return the `coarse_target`, or the part of it within `radius_m` of `centre` (3,)."""
+        if not self._is_local:
+            return self.coarse_target
+        place = self._find_place("coarse", centre, radius_m, lambda points: Surface(points, self._coarse_voxel_m))
+        coarse: Surface = place.index
+        return coarse
+
+    def nearest_near(
+        self, centre: Float64Array, radius_m: float, points: Float64Array
+    ) -> tuple[Float64Array, Float64Array]:
+        """Return the (N, 3) nearest map point of each of (N, 3) points, and the squared distances (N,), square metres.
+
+        Exact where the nearest point is within `radius_m` of `centre` (3,).
+        """
+        tree: Any = self._fine.tree if self._fine else self._tree
+        of_map = self.points
+        if self._is_local:
+            place = self._find_place("tree", centre, radius_m, small_gicp.KdTree)
+            tree, of_map = place.index, self.points[place.rows]
+        found, squared_m2 = tree.batch_nearest_neighbor_search(points)
+        return of_map[found], np.asarray(squared_m2)
+
+    def _find_place(
+        self, kind: str, centre: Float64Array, radius_m: float, index: Callable[[Float64Array], Any]
+    ) -> _Place:
+        """Return an indexed place that holds a sphere; index one if there is none yet."""
+        for place in self._places:
+            if place.kind == kind and np.linalg.norm(centre - place.centre) + radius_m <= place.radius_m:
+                return place
+        start = perf_counter()
+        valid_m = radius_m + _SLACK_M
+        rows = self.columns.crop(centre, valid_m + _MARGIN_M)
+        if len(rows) < MIN_SPHERE_POINTS:  # far off the map: what is nearest may be anywhere
+            valid_m, rows = np.inf, np.arange(len(self.points))
+        place = _Place(kind, centre, valid_m, rows, index(self.points[rows]))
+        self._places.append(place)
+        self.local_s += perf_counter() - start
+        return place
+
     def sphere(self, centre: Float64Array, radius_m: float) -> Float64Array:
         """Return the (N, 3) map points within `radius_m` of `centre` (3,)."""
         return self.columns.points_within(centre, radius_m)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Place:
+    """An indexed part of a map: its index is valid within `radius_m`, and was made of the points in `rows`."""
+
+    kind: str
+    centre: Float64Array
+    radius_m: float
+    rows: Int64Array
+    index: Any
 
 
 def _thin(

@@ -170,6 +170,7 @@ def _register_place(
     if len(points) < MIN_SPHERE_POINTS:
         return None
     own = sample_evenly(points)
+    target, _ = before.target_near(transform(guess, centre[None])[0], step.radius_m + step.correspondence_m)
 
     def judge(found: Float64Array) -> tuple[Float64Array, SurfaceFit, Float64Array] | None:
         held = _limit_motion(found, guess, centre, apart_m)
@@ -184,10 +185,10 @@ def _register_place(
         return held, fit, information
 
     if step.first_try_m is not None:
-        first = judge(align_to_planes(own, centre, before.target, guess, step.first_try_m))
+        first = judge(align_to_planes(own, centre, target, guess, step.first_try_m))
         if first is not None and first[1].inlier_share(config.inlier_m) >= _CLEAR_FIT:
             return first
-    return judge(align_by_gicp(points, centre, before.target, guess, step.correspondence_m, step.gicp_voxel_m))
+    return judge(align_by_gicp(points, centre, target, guess, step.correspondence_m, step.gicp_voxel_m))
 
 
 def _limit_motion(

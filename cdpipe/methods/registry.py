@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.plugins import ABSENT, METHODS, extra_version, load_entry_point, require_extra
+from cdpipe.core.plugins import ABSENT, METHODS, describe_entry_point, extra_version, load_entry_point, require_extra
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.report import ChangeRegions, ChangeReport
 from cdpipe.model.types import DescriptorSet, MergedMaps
@@ -29,6 +29,23 @@ Propose = Callable[[MergedMaps, DescriptorSet, DescriptorSet, PipelineConfig], C
 # Sources of ours that need an extra (`cdpipe.core.plugins`), of the same name but for `_EXTRAS`, and its package.
 PACKAGES = {"m3c2": "py4dgeo", "m3c2-ep": "py4dgeo", "dufomap": "dufomap", "octomap": "pyoctomap"}
 _EXTRAS = {"m3c2-ep": "m3c2"}
+# what each source of ours does; those of other packages are described by their docstrings
+_DESCRIPTIONS = {
+    "scan": "the paper: descriptors of single scans, against the most similar one or that of the same place",
+    "sphere": "learned descriptors of the map around each keyframe, compared with the other map at the same place",
+    "sphere-difference": "share of new points around each keyframe: no descriptor, no network",
+    "every-keyframe": "every keyframe is a region: the extraction alone decides",
+    "voxel-diff": "voxels of the whole map that are empty in the other map, clustered",
+    "c2c": "points of the whole map far from every point of the other one (cloud to cloud), clustered",
+    "m3c2": "distance of both surfaces along their normal (Lague et al. 2013), clustered; extra m3c2",
+    "m3c2-ep": "m3c2 with a level of detection by error propagation (Winiwarter et al. 2021); extra m3c2",
+    "dufomap": "what stands where rays of the other session saw a void (Duberg et al. 2024); extra dufomap",
+    "octomap": "what stands in free voxels of the other session's occupancy map (Hornung et al. 2013); extra octomap",
+    "removert": "what range images of the other session see through (Kim and Kim 2020)",
+    "erasor": "what stands in columns that the other session's scans found flat (Lim et al. 2021)",
+    "range-net": "a network that compares range images of both maps, pixel by pixel",
+    "random-regions": "regions drawn at random: a control",
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +63,11 @@ class Method:
     propose: Propose | None
     uses_descriptors: bool
     has_clusters: bool
+
+
+def describe_method(name: str) -> str:
+    """Return what a registered source of regions does, in one line; "" where its package does not say."""
+    return _DESCRIPTIONS.get(name) or describe_entry_point(METHODS, name)
 
 
 def load_source(config: PipelineConfig) -> Method:

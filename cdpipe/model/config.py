@@ -103,13 +103,19 @@ class SphereConfig(_Grown):
     weights: str = Field("", description="file of weights that `tunnelcd train` wrote; empty: the shipped ones")
 
 
-class MergeConfig(Settings):
+class MergeConfig(_Grown):
     """Alignment of both maps: candidate pairs of places, registration of spheres, acceptance, local refinement."""
+
+    newer: ClassVar[tuple[str, ...]] = ("first_every",)
 
     method: Literal["voting", "frame", "kiss-matcher"] = Field(
         "voting", description="candidates that agree; FRAME's closest pair; or KISS-Matcher on the whole maps"
     )
     n_candidates: Count = Field(4, description="hypotheses tried by `voting`")
+    first_every: Count = Field(
+        1,
+        description="`voting`: compare every n-th keyframe first, every 2n-th of the after session; all if refused",
+    )
     sphere_radius_m: Positive = Field(10.0, description="submap around a pair (FRAME: 10 m)")
     voxel_m: Cell = Field(0.4, description="thinning of a sphere before it is registered")
     seen_within_m: Positive = Field(15.0, description="map points seen only from farther away are not used")
@@ -387,6 +393,15 @@ class PipelineConfig(Settings):
     options: dict[str, bool | int | float | str] = Field(
         {}, description="settings of a plugin's method, by its own names"
     )
+
+    @property
+    def described_every(self) -> int:
+        """Every which keyframe is described before the merge: `merge.first_every` where the merge alone reads q and w.
+
+        1 for the query of scan descriptors, and for a plugin's source, which may read them.
+        """
+        is_read = self.regions.source not in (*SOURCES_AT_KEYFRAMES[1:], *WHOLE_MAP_SOURCES)
+        return 1 if is_read or self.merge.method != "voting" else self.merge.first_every
 
     @model_validator(mode="after")
     def _has_clusters(self) -> PipelineConfig:

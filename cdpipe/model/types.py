@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
@@ -234,10 +234,18 @@ class DescriptorSet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedSession:
-    """A mapped session: its thinned map, and descriptors of all of its keyframes or of none."""
+    """A mapped session: its thinned map, and descriptors of all of its keyframes or of none.
+
+    Attributes:
+        map: The map.
+        descriptors: The descriptors. With `describe_rest`, q and w are zeros but for the keyframes that are compared
+            first (`cdpipe.merge.candidates.first_keyframes`).
+        describe_rest: Returns the descriptors of all keyframes, or None if `descriptors` holds them.
+    """
 
     map: PointMap
     descriptors: DescriptorSet
+    describe_rest: Callable[[], DescriptorSet] | None = None
 
     def __post_init__(self) -> None:
         described = self.descriptors.keyframe_scans
@@ -248,6 +256,10 @@ class MappedSession:
             )
         if not np.isfinite(self.descriptors.q).all():
             raise ValueError("descriptors.q is not finite: describe the session again")
+
+    def described(self) -> MappedSession:
+        """Return the session with the q and w of all keyframes; describes those that are missing."""
+        return self if self.describe_rest is None else MappedSession(self.map, self.describe_rest())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, transform, travelled_m
+from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array, Int64Array, transform, travelled_m
 from cdpipe.core.threads import in_threads
 from cdpipe.core.voxel import cell_keys
 from cdpipe.model.types import MergedMaps, PointMap, SessionName
@@ -34,8 +34,9 @@ _REACH_M = 16.0
 _LEAST_RETURNS, _THINNED = 2, 0.05
 # At most so many scans are averaged at once, and so many points moved.
 _SCANS, _BLOCK = 16, 1 << 18
-_NO_KEYS = np.zeros(0, dtype=np.int64)
-_NONE = np.zeros((0, 3)), np.zeros(0), np.zeros(0), _NO_KEYS
+# So many stretches are averaged before their means are put together.
+_STRETCHES = 64
+_NONE = np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +55,7 @@ class NearReturns:
     points: Float64Array
     path_m: Float64Array
     weights: Float64Array
-    counts: Int64Array
+    counts: Int32Array
     cell_of: Int64Array
     map_T_sensor: Float64Array
 
@@ -87,17 +88,31 @@ def near_returns(merged: MergedMaps, session: SessionName) -> NearReturns:
     point_map = merged.map_of(session)
     poses = point_map.odom_T_sensor
     path_m = travelled_m(poses)
-    map_T_odom = np.tile(np.eye(4), (len(poses), 1, 1)) if session == "before" else merged.alignment.at(poses[:, :3, 3])
-    parts = in_threads(partial(_average_stretch, point_map, map_T_odom, path_m), _stretches(path_m))
-    points, paths_m, weights, counts = (np.concatenate(each) for each in zip(_NONE, *parts, strict=True))
-    return NearReturns(points, paths_m, weights, counts, number_cells(points), map_T_odom @ poses)
+    map_T_odom = None if session == "before" else merged.alignment.at(poses[:, :3, 3])
+    average = partial(_average_stretch, point_map, map_T_odom, path_m)
+    stretches, n_returns, n = _stretches(path_m), int(point_map.scan_offsets[-1]), 0
+    # there are no more means than returns; what is not written takes no memory
+    found = tuple(np.empty((n_returns, *each.shape[1:]), dtype=each.dtype) for each in _NONE)
+    for first in range(0, len(stretches), _STRETCHES):
+        for part in in_threads(average, stretches[first : first + _STRETCHES]):
+            end = n + len(part[0])
+            for whole, each in zip(found, part, strict=True):
+                whole[n:end] = each
+            n = end
+    points, paths_m, weights, counts, keys = (each[:n] for each in found)
+    cell_of = number_cells(keys)
+    return NearReturns(points, paths_m, weights, counts, cell_of, poses if map_T_odom is None else map_T_odom @ poses)
 
 
-def number_cells(points: Float64Array) -> Int64Array:
-    """Return the number of the cell of each of (N, 3) points, in the order of the cells' keys."""
-    blocks = [points[start : start + _BLOCK] for start in range(0, len(points), _BLOCK)]
-    keys = np.concatenate([_NO_KEYS, *in_threads(partial(cell_keys, cell_m=CELL_M), blocks)])
-    return np.unique(keys, return_inverse=True)[1]
+def number_cells(keys: Int64Array) -> Int64Array:
+    """Return the number of the cell of each of (N,) keys, in the order of the keys.
+
+    Most neighbours are in order, and such keys are found faster than sorted with their places.
+    """
+    ordered = np.sort(keys)
+    ordered = ordered[np.append(True, ordered[1:] != ordered[:-1])[: len(ordered)]]
+    blocks = [keys[start : start + _BLOCK] for start in range(0, len(keys), _BLOCK)]
+    return np.concatenate([_NONE[-1], *in_threads(partial(np.searchsorted, ordered), blocks)])
 
 
 def _stretches(path_m: Float64Array) -> list[range]:
@@ -113,41 +128,50 @@ def _stretches(path_m: Float64Array) -> list[range]:
 
 
 def _average_stretch(
-    point_map: PointMap, map_T_odom: Float64Array, path_m: Float64Array, scans: range
-) -> tuple[Float64Array, Float64Array, Float64Array, Int64Array]:
-    """Return points, path positions, weights and counts of the means of some scans."""
+    point_map: PointMap, map_T_odom: Float64Array | None, path_m: Float64Array, scans: range
+) -> tuple[Float64Array, Float64Array, Float64Array, Int32Array, Int64Array]:
+    """Return points, path positions, weights, counts and keys of the cells of the means of some scans."""
     points, weights, paths_m = [], [], []
     for scan in scans:
         found = point_map.positions_of(slice(*point_map.scan_offsets[scan : scan + 2]))
-        range_m = np.linalg.norm(found - point_map.odom_T_sensor[scan, :3, 3], axis=1)
+        x, y, z = (found - point_map.odom_T_sensor[scan, :3, 3]).T
+        range_m = np.sqrt(x * x + y * y + z * z)
         near = np.flatnonzero(range_m < _REACH_M)
-        points.append(transform(map_T_odom[scan], found[near]))
-        weights.append(1.0 / (_RANGE_M**2 + (_BEAM_RAD**2 + _DRIFT**2) * range_m[near] ** 2))
+        found, range_m = found[near], range_m[near]
+        points.append(found if map_T_odom is None else transform(map_T_odom[scan], found))
+        weights.append(1.0 / (_RANGE_M**2 + (_BEAM_RAD**2 + _DRIFT**2) * range_m**2))
         paths_m.append(np.full(len(near), path_m[scan]))
     everywhere, weight, path = np.concatenate(points), np.concatenate(weights), np.concatenate(paths_m)
-    _, group = np.unique(cell_keys(everywhere, CELL_M), return_inverse=True)
+    keys, group = np.unique(cell_keys(everywhere, CELL_M), return_inverse=True)
     summed: Float64Array = np.bincount(group, weight).astype(np.float64)
     # from the stretch's start on, so that rounding moves no mean into the stretch before
     start_m = np.floor(path_m[scans[0]] / _FOLD_M) * _FOLD_M
     *means, since_start_m = (np.bincount(group, weight * each) / summed for each in (*everywhere.T, path - start_m))
-    return np.stack(means, axis=1), since_start_m + start_m, summed, np.bincount(group).astype(np.int64)
+    counts = np.bincount(group).astype(np.int32)
+    return np.stack(means, axis=1), since_start_m + start_m, summed, counts, keys
 
 
-def make_cells(returns: NearReturns) -> SurfaceCells:
+def make_cells(returns: NearReturns, *, with_folds: bool = True) -> SurfaceCells:
     """Return the cells of a session. False returns lie alone: a cell of one return is left out.
 
-    In a map that was thinned before, nearly every cell holds one, and all are kept.
+    In a map that was thinned before, nearly every cell holds one, and all are kept. Without folds, all returns of a
+    cell are in one.
     """
-    n = int(returns.cell_of.max(initial=-1)) + 1
-    group = returns.cell_of * N_FOLDS + np.floor(returns.path_m / _FOLD_M).astype(np.int64) % N_FOLDS
-    values = (returns.weights, *(returns.weights * axis for axis in returns.points.T))
+    n, n_folds = int(returns.cell_of.max(initial=-1)) + 1, N_FOLDS if with_folds else 1
+    group = returns.cell_of * n_folds
+    group += np.floor(returns.path_m / _FOLD_M).astype(np.int64) % n_folds
     counts = np.bincount(returns.cell_of, returns.counts, n)
     is_thinned = np.count_nonzero(counts > 1) < _THINNED * n
-    kept = counts >= (1 if is_thinned else _LEAST_RETURNS)
-    weights, *sums = in_threads(lambda each: np.bincount(group, each, n * N_FOLDS).reshape(n, N_FOLDS)[kept], values)
-    points = np.stack([each.sum(axis=1) for each in sums], axis=1) / weights.sum(axis=1, keepdims=True)
-    with np.errstate(invalid="ignore"):
-        fold_offsets = np.stack(
-            [(each / weights - points[:, axis, None]).astype(np.float32) for axis, each in enumerate(sums)], axis=-1
-        )
+    kept = np.flatnonzero(counts >= (1 if is_thinned else _LEAST_RETURNS))
+
+    weights = np.bincount(group, returns.weights, n * n_folds).reshape(n, n_folds)[kept]
+    points, fold_offsets = np.empty((len(kept), 3)), np.empty((len(kept), n_folds, 3), dtype=np.float32)
+
+    def average(axis: int) -> None:
+        sums = np.bincount(group, returns.weights * returns.points[:, axis], n * n_folds).reshape(n, n_folds)[kept]
+        points[:, axis] = sums.sum(axis=1) / weights.sum(axis=1)
+        with np.errstate(invalid="ignore"):
+            fold_offsets[:, :, axis] = sums / weights - points[:, axis, None]
+
+    in_threads(average, range(3))
     return SurfaceCells(points, fold_offsets, cKDTree(points, balanced_tree=False), returns.map_T_sensor)

@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array
 from cdpipe.core.plugins import require_extra
+from cdpipe.core.threads import allowed_threads
 from cdpipe.model.config import PipelineConfig, SurfaceConfig
 from cdpipe.model.report import ChangedObject, SurfaceField
 from cdpipe.model.types import MergedMaps
@@ -52,8 +53,12 @@ _SAMPLE, _ON_PLACE_M, _SCAN_WINDOW_M = 400_000, 0.2, 4.0
 _TILT_RAD, _CLOSE_M = 2e-3, 4.0
 # The variance of a mean from four folds is noisy: that of a place is the mean over its neighbours.
 _NEIGHBOURS = 8
-# Share of the roughness that both spheres do not share, as standard deviation, and the least error of a mean.
+# Least share of the roughness that both spheres do not share, as standard deviation, and the least error of a mean.
 _ROUGHNESS, _LEAST_M = 0.18, 0.0004
+# Two means over few cells of one rough surface differ by that share of what they would if each session drew its cells
+# from a spread as wide. Where the cells lie on no single surface, as on wire mesh and the rock behind it, each does:
+# it sees its own share of the wire, over whole patches. Places less flat than this are of that kind.
+_OF_ONE_SURFACE, _OF_SEVERAL, _SEVERAL_FLATNESS = 0.6, 1.2, 0.15
 
 
 def measure_surface(
@@ -68,12 +73,11 @@ def measure_surface(
     """
     start = time.perf_counter()
     settings = config.surface
-    before, after = (near_returns(merged, name) for name in ("before", "after"))
-    cells = make_cells(before)
-    del before
+    cells = make_cells(near_returns(merged, "before"))
     path = merged.before.odom_T_sensor
     places = choose_places(cells, path[:, :3, 3], settings.spacing_m, settings.normal_m)
     chainage_m, angle_deg, _ = unroll(places.points, path)
+    after = near_returns(merged, "after")
     measured = load_method(settings.method)(cells, after, places, chainage_m, config)
     is_rock, is_of_object = split_rock(objects, places, measured.along_m)
     along_m, displacement_m = (
@@ -102,11 +106,23 @@ def measure_planes(
     motions = fit_motions(places.points, places.normals, _trust(places, found), chainage_m, settings.window_m)
     explained_m, alignment_m2 = motions.along(places.points, places.normals, chainage_m)
     noise_m2 = _smooth_variance(places.points, found.variance_m2)
-    rough_m2 = (_ROUGHNESS * places.roughness_m) ** 2
+    rough_m2, shared_rough_m2 = _sample_roughness(places, found.sampling)
     tilt_m2 = (_TILT_RAD * np.maximum(places.seen_from_m - _CLOSE_M, 0.0)) ** 2
     shared_m2 = alignment_m2 + tilt_m2
-    level_m, shared_m = (Z95 * np.sqrt(each) for each in (noise_m2 + rough_m2 + shared_m2 + _LEAST_M**2, shared_m2))
+    own_m2 = noise_m2 + rough_m2 + shared_m2 + _LEAST_M**2
+    level_m, shared_m = (Z95 * np.sqrt(each) for each in (own_m2, shared_m2 + shared_rough_m2))
     return Measured(found.nearest_m - explained_m, found.along_m - explained_m, level_m, shared_m, laid)
+
+
+def _sample_roughness(places: SurfacePlaces, sampling: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Return the (Q,) variance of the difference of two means by the roughness, and the part that neighbours share.
+
+    The (Q,) `sampling` is the sum of the inverse numbers of cells, NaN where there are too few.
+    """
+    is_several = places.flatness > _SEVERAL_FLATNESS
+    drawn = np.where(is_several, _OF_SEVERAL, _OF_ONE_SURFACE) ** 2 * np.nan_to_num(sampling)
+    rough_m2 = places.roughness_m**2
+    return rough_m2 * np.maximum(drawn, _ROUGHNESS**2), rough_m2 * np.where(is_several, drawn, 0.0)
 
 
 def _trust(places: SurfacePlaces, found: Offsets) -> Float64Array:
@@ -127,7 +143,7 @@ def _fit_scans(
     """Return the motions of the after scans, by path position of the sensor, that lay their returns on still places."""
     some = np.arange(0, len(places.points), _EVERY)
     places = places.take(some)
-    found = measure_offsets(before, make_cells(after), places, settings.radius_m, with_variance=False)
+    found = measure_offsets(before, make_cells(after, with_folds=False), places, settings.radius_m, with_variance=False)
     told_m = _trust(places, found)
     motions = fit_motions(places.points, places.normals, told_m, chainage_m[some], settings.window_m)
     is_still = _is_still(told_m - motions.along(places.points, places.normals, chainage_m[some])[0])
@@ -136,7 +152,7 @@ def _fit_scans(
     points = after.points[sample]
     if len(still) == 0:
         return fit_motions(points[:0], points[:0], points[:0, 0], points[:0, 0], _SCAN_WINDOW_M)
-    nearest = cKDTree(places.points[still]).query(points, distance_upper_bound=_ON_PLACE_M)
+    nearest = cKDTree(places.points[still]).query(points, distance_upper_bound=_ON_PLACE_M, workers=allowed_threads())
     on = np.flatnonzero(np.isfinite(nearest[0]))
     place = still[np.asarray(nearest[1], dtype=np.int64)[on]]
     normals = places.normals[place]
@@ -174,5 +190,6 @@ def _smooth_variance(points: Float64Array, variance_m2: Float64Array) -> Float64
     known = np.flatnonzero(np.isfinite(variance_m2))
     if len(known) == 0:
         return np.full(len(points), np.nan)
-    index = cKDTree(points[known]).query(points, k=min(_NEIGHBOURS, len(known)))[1].reshape(len(points), -1)
+    tree, k = cKDTree(points[known]), min(_NEIGHBOURS, len(known))
+    index = tree.query(points, k=k, workers=allowed_threads())[1].reshape(len(points), -1)
     return np.asarray(variance_m2[known][index].mean(axis=1))

@@ -10,9 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, Int64Array, plane_jacobian
-from cdpipe.core.threads import in_threads
+from cdpipe.core.threads import allowed_threads, in_threads
 from cdpipe.core.voxel import cell_keys
 
 _STEP_M = 2.0
@@ -27,6 +28,13 @@ _TO_SIGMA = 1.4826
 _LEAST_SIGMA_M = 3e-4
 # Rotation and translation that nothing constrains stay zero.
 _DAMPING = 1e-3
+# A residual that many times the noise says that much of a window moved. The fit is then begun on each half of the
+# round alone, too. It is taken where that share of the window is within twice the noise, more of it than by the first
+# fit, and most of what is within six times: what moved lies apart. No motion leaves such a part of a convergence all
+# round.
+_MUCH, _WITHIN, _NEAR = 3.0, 2.0, 6.0
+_LEAST_SHARE, _MORE, _APART = 0.3, 0.1, 0.7
+_NOISE_SAMPLE = 20_000  # about so many offsets tell the noise
 # Neighbouring places err together: a block of this edge counts as one observation in the covariance.
 _BLOCK_M = 1.0
 
@@ -49,13 +57,22 @@ class PathMotions:
 
     def shifts(self, points: Float64Array, path_m: Float64Array) -> Float64Array:
         """Return the (N, 3) displacement of (N, 3) points, each by the motion at its (N,) path position."""
-        shifts = np.zeros((len(points), 3))
-        for station, share in self._around(path_m):
-            turn, slide = self.motions[station, :3], self.motions[station, 3:]
-            (a, b, c), (x, y, z) = turn.T, (points - self.centres[station]).T
-            turned = np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=1)
-            shifts += share[:, None] * (turned + slide)
+        shifts = np.empty((len(points), 3))
+        (station, _), (following, share) = self._around(path_m)
+        for number in np.unique(station):
+            own = np.flatnonzero(station == number)
+            other = following[own[0]]
+            offsets = points[own] - self.centres[number]
+            turn, slide = self._linear(number, self.centres[number])
+            next_turn, next_slide = self._linear(other, self.centres[number])
+            further = offsets @ (next_turn - turn) + (next_slide - slide)
+            shifts[own] = offsets @ turn + slide + share[own, None] * further
         return shifts
+
+    def _linear(self, station: int, origin: Float64Array) -> tuple[Float64Array, Float64Array]:
+        """Return the (3, 3) matrix and the (3,) shift of a motion: of offsets from an origin, as rows."""
+        turn, slide = self.motions[station, :3], self.motions[station, 3:]
+        return np.cross(turn, np.eye(3)), slide + np.cross(turn, origin - self.centres[station])
 
     def along(
         self, points: Float64Array, normals: Float64Array, path_m: Float64Array
@@ -94,6 +111,7 @@ def fit_motions(
     points, normals, along_m, path_m = points[order], normals[order], along_m[order], path_m[order]
     first_m, last_m = (float(path_m[0]), float(path_m[-1])) if len(path_m) else (0.0, 0.0)
     stations_m = np.arange(first_m, last_m + _STEP_M, _STEP_M)
+    noise_m = _find_noise(points, along_m)
 
     def fit(station_m: float) -> tuple[Float64Array, Float64Array, Float64Array]:
         used = slice(*np.searchsorted(path_m, (station_m - window_m, station_m + window_m)))
@@ -102,23 +120,65 @@ def fit_motions(
         share = np.maximum(1 - ((path_m[used] - station_m) / window_m) ** 2, 0.0)
         centre = points[used].mean(axis=0)
         jacobian = plane_jacobian(points[used] - centre, normals[used])
-        return centre, *_fit(jacobian, along_m[used], share, points[used])
+        return centre, *_fit_best(jacobian, along_m[used], share, points[used], noise_m)
 
     centres, motions, covariances = zip(*in_threads(fit, stations_m), strict=True)
     return PathMotions(first_m, np.stack(centres), np.stack(motions), np.stack(covariances))
 
 
-def _fit(
-    jacobian: Float64Array, along_m: Float64Array, share: Float64Array, points: Float64Array
+def _find_noise(points: Float64Array, along_m: Float64Array) -> float:
+    """Return the standard deviation by which offsets of neighbours differ, of one of them."""
+    if len(points) < _LEAST_OFFSETS:
+        return 0.0
+    some = np.arange(0, len(points), max(len(points) // _NOISE_SAMPLE, 1))
+    nearest = np.asarray(cKDTree(points).query(points[some], k=[2], workers=allowed_threads())[1])[:, 0]
+    return _TO_SIGMA * float(np.median(np.abs(along_m[some] - along_m[nearest])) / np.sqrt(2.0))
+
+
+def _fit_best(
+    jacobian: Float64Array, along_m: Float64Array, share: Float64Array, points: Float64Array, noise_m: float
 ) -> tuple[Float64Array, Float64Array]:
-    """Return the (6,) motion and its (6, 6) covariance: least absolute values first, then Tukey's biweight."""
-    weights, motion = share.copy(), np.zeros(6)
+    """Return the (6,) motion that leaves most of a window within the noise, and its (6, 6) covariance.
+
+    Where half of the round moved, a fit that begins on all of it splits the difference.
+    """
+    noise_m = max(noise_m, _LEAST_SIGMA_M)
+    motion, covariance = _fit(jacobian, along_m, share, points)
+
+    def count(motion: Float64Array, times: float) -> float:
+        return float(share @ (np.abs(along_m - jacobian @ motion) < times * noise_m)) / max(float(share.sum()), 1e-12)
+
+    if _TO_SIGMA * float(np.median(np.abs(along_m - jacobian @ motion))) <= _MUCH * noise_m:
+        return motion, covariance
+    best, normals = max(count(motion, _WITHIN) + _MORE, _LEAST_SHARE), jacobian[:, 3:]
+    across = np.linalg.eigh((normals * share[:, None]).T @ normals)[1][:, 1:].T
+    for half in (*across, *-across):
+        found = _fit(jacobian, along_m, share, points, share * (normals @ half > 0), noise_m)
+        held = count(found[0], _WITHIN)
+        if held > best and held > _APART * count(found[0], _NEAR):
+            best, (motion, covariance) = held, found
+    return motion, covariance
+
+
+def _fit(
+    jacobian: Float64Array,
+    along_m: Float64Array,
+    share: Float64Array,
+    points: Float64Array,
+    start: Float64Array | None = None,
+    noise_m: float | None = None,
+) -> tuple[Float64Array, Float64Array]:
+    """Return the (6,) motion and its (6, 6) covariance: least absolute values first, then Tukey's biweight.
+
+    The fit begins with the weights `start`. Without `noise_m` the residuals tell the scale of the biweight.
+    """
+    weights, motion = (share if start is None else start).copy(), np.zeros(6)
     for number in range(_ROUNDS):
         hessian = (jacobian * weights[:, None]).T @ jacobian
         hessian += _DAMPING * np.diag(np.diag(hessian).reshape(2, 3).max(axis=1).repeat(3))
         motion[:] = np.linalg.solve(hessian, (jacobian * weights[:, None]).T @ along_m)
         residual_m = np.abs(along_m - jacobian @ motion)
-        sigma_m = max(_TO_SIGMA * float(np.median(residual_m)), _LEAST_SIGMA_M)
+        sigma_m = noise_m or max(_TO_SIGMA * float(np.median(residual_m)), _LEAST_SIGMA_M)
         if number < _L1_ROUNDS:
             weights = share / np.maximum(residual_m, max(_L1_SHARE * sigma_m, _LEAST_SIGMA_M))
         else:

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.core.threads import in_threads
+from cdpipe.core.threads import allowed_threads, in_threads
 from cdpipe.surface.cells import N_FOLDS, SurfaceCells
 from cdpipe.surface.places import SurfacePlaces
 
@@ -48,12 +48,14 @@ class Offsets:
         nearest_m: (Q,) the same by the distance to the nearest cell of the after surface, where that is far.
         variance_m2: (Q,) variance of `along_m`, from the differences between folds, of every fourth place; else NaN.
         own_m: (Q,) mean height of the before surface around each place, along the normal; NaN as `along_m`.
+        sampling: (Q,) sum of the inverse numbers of cells that either mean is over; NaN as `along_m`.
     """
 
     along_m: Float64Array
     nearest_m: Float64Array
     variance_m2: Float64Array
     own_m: Float64Array
+    sampling: Float64Array
 
 
 def measure_offsets(
@@ -74,39 +76,45 @@ def measure_offsets(
         with_variance: Whether `variance_m2` is asked for; otherwise it is NaN.
     """
     n = len(places.points)
-    along_m, variance_m2, own_m = (np.full(n, np.nan) for _ in range(3))
+    along_m, variance_m2, own_m, sampling = (np.full(n, np.nan) for _ in range(4))
     if n == 0 or len(after.points) == 0:
-        return Offsets(along_m, along_m.copy(), variance_m2, own_m)
+        return Offsets(along_m, along_m.copy(), variance_m2, own_m, sampling)
     start_m = _find_surface(after, places)
     for widening in _WIDENINGS:
         rest = np.flatnonzero(np.isfinite(start_m) & np.isnan(along_m))
         points, normals = places.points[rest], places.normals[rest]
         sphere = partial(_settle, points, normals, widening * radius_m, with_variance=with_variance)
-        own_m[rest], own_m2 = sphere(before, np.zeros(len(rest)))
-        heights_m, other_m2 = sphere(after, start_m[rest])
+        own_m[rest], own_m2, n_own = sphere(before, np.zeros(len(rest)))
+        heights_m, other_m2, n_other = sphere(after, start_m[rest])
         along_m[rest], variance_m2[rest] = heights_m - own_m[rest], own_m2 + other_m2
+        sampling[rest] = 1.0 / n_own + 1.0 / n_other
     far = np.flatnonzero(np.abs(along_m) > _FAR_M)
     hits = places.points[far] + along_m[far, None] * places.normals[far]
     along_m[far[before.tree.query(hits)[0] < NEW * np.abs(along_m[far])]] = np.nan
     far = far[np.isfinite(along_m[far])]
     nearest_m = along_m.copy()
     nearest_m[far] = np.sign(along_m[far]) * np.minimum(after.tree.query(places.points[far])[0], np.abs(along_m[far]))
-    return Offsets(along_m, nearest_m, variance_m2, own_m)
+    return Offsets(along_m, nearest_m, variance_m2, own_m, sampling)
 
 
 def _find_surface(after: SurfaceCells, places: SurfacePlaces) -> Float64Array:
     """Return the (Q,) height along the normal at which the after surface is near; NaN where it is nowhere."""
-    start_m = np.where(after.tree.query(places.points, distance_upper_bound=_NEAR_M)[0] <= _NEAR_M, 0.0, np.nan)
+    start_m = np.where(_is_near(after, places.points), 0.0, np.nan)
     rest = np.flatnonzero(np.isnan(start_m))
     for step in range(1, int(_INTO_ROCK_M / _STEP_M) + 1):
         for height_m in (step * _STEP_M, -step * _STEP_M):
             if height_m > _INTO_VOID_M or len(rest) == 0:
                 continue
-            probes = places.points[rest] + height_m * places.normals[rest]
-            is_near = after.tree.query(probes, distance_upper_bound=_NEAR_M)[0] <= _NEAR_M
+            is_near = _is_near(after, places.points[rest] + height_m * places.normals[rest])
             start_m[rest[is_near]] = height_m
             rest = rest[~is_near]
     return start_m
+
+
+def _is_near(cells: SurfaceCells, points: Float64Array) -> BoolArray:
+    """Mark the (N, 3) points that have a cell nearby."""
+    distance_m, _ = cells.tree.query(points, distance_upper_bound=_NEAR_M, workers=allowed_threads())
+    return np.asarray(distance_m <= _NEAR_M)
 
 
 def _settle(
@@ -117,8 +125,8 @@ def _settle(
     start_m: Float64Array,
     *,
     with_variance: bool,
-) -> tuple[Float64Array, Float64Array]:
-    """Return the (N,) mean height along the normals in a sphere, NaN of too few cells, and its variance, or NaN.
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Return (N,) mean height along the normals in a sphere, its variance, and number of cells; NaN of too few cells.
 
     The first sphere stands `start_m` above each of the (N, 3) points, the second on the surface that the first found.
     Both sessions settle alike: at an edge the second sphere holds other cells than the first.
@@ -126,8 +134,9 @@ def _settle(
     blocks = [slice(start, start + _BLOCK) for start in range(0, len(points), _BLOCK)]
     settle = partial(_settle_block, cells, radius_m, with_variance)
     parts = in_threads(lambda rows: settle(points[rows], normals[rows], start_m[rows]), blocks)
-    heights_m, variance_m2 = zip(*parts, strict=True) if parts else ((np.zeros(0),), (np.zeros(0),))
-    return np.concatenate(heights_m), np.concatenate(variance_m2)
+    none = np.zeros(0)
+    heights_m, variance_m2, counts = (np.concatenate(each) for each in zip((none, none, none), *parts, strict=True))
+    return heights_m, variance_m2, counts
 
 
 def _settle_block(
@@ -137,7 +146,7 @@ def _settle_block(
     points: Float64Array,
     normals: Float64Array,
     start_m: Float64Array,
-) -> tuple[Float64Array, Float64Array]:
+) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Settle some spheres. Both spheres of a place take their cells from one search, but where they lie far apart."""
     distance_m, index, heights_m = _look_around(cells, points, normals, start_m, _SLACK * radius_m)
     settled_m = _average(heights_m, distance_m <= radius_m)
@@ -150,7 +159,8 @@ def _settle_block(
     variance_m2, some = np.full(len(points), np.nan), slice(None, None, _EVERY)
     if with_variance:
         variance_m2[some] = _vary(cells, index[some], is_inside[some], normals[some])
-    return _average(heights_m, is_inside), variance_m2
+    settled_m = _average(heights_m, is_inside)
+    return settled_m, variance_m2, np.where(np.isfinite(settled_m), is_inside.sum(axis=1), np.nan)
 
 
 def _look_around(

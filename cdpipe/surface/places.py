@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, Int64Array
-from cdpipe.core.threads import in_threads
+from cdpipe.core.threads import allowed_threads, in_threads
 from cdpipe.core.voxel import cell_means
 from cdpipe.surface.cells import CELL_M, SurfaceCells
 
@@ -56,7 +56,7 @@ def choose_places(before: SurfaceCells, path: Float64Array, spacing_m: float, no
         normal_m: Radius of the cells that the plane is fitted to, metres.
     """
     means, _ = cell_means(before.points, spacing_m)
-    chosen = np.unique(before.tree.query(means)[1])
+    chosen = np.unique(before.tree.query(means, workers=allowed_threads())[1])
     points = before.points[chosen]
     blocks = [points[start : start + _BLOCK] for start in range(0, len(points), _BLOCK)]
     parts = in_threads(lambda block: _fit_planes(before, block, normal_m), blocks)
@@ -70,7 +70,7 @@ def choose_places(before: SurfaceCells, path: Float64Array, spacing_m: float, no
     kept = np.flatnonzero(counts >= _LEAST_CELLS)
     normals, spreads_m = normals[kept], spreads_m[kept]
     points, radius_m = points[kept], _DISC * spacing_m
-    shares = cKDTree(points).query_ball_point(points, radius_m, return_length=True)
+    shares = cKDTree(points).query_ball_point(points, radius_m, return_length=True, workers=allowed_threads())
     areas_m2 = np.pi * radius_m**2 / np.asarray(shares, dtype=np.float64)
     flatness = spreads_m[:, 0] / np.maximum(spreads_m[:, 1], CELL_M / 2)
     return SurfacePlaces(points, normals, spreads_m[:, 0], flatness, areas_m2, np.asarray(seen_from_m)[kept])

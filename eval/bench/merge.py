@@ -5,14 +5,16 @@ KISS-Matcher runs at the coarsest voxel that merged every pair of maps of that s
 less and costs 5 mm at most.
 
 Both methods end at an accepted rigid transform: ours starts from descriptors (all-in), stored vectors or indexed maps,
-the rival from two clouds. Refinement along the path is a row of its own, because the rival has no such step. The time
-of a wrong rival is not compared. Where ours is refused or wrong, the row gives the reason and misses its target.
+the rival from two clouds. All-in counts the descriptors of the keyframes that the merge compares: the first ones, and
+all of them if these did not suffice. Refinement along the path is a row of its own, because the rival has no such step.
+The time of a wrong rival is not compared. Where ours is refused or wrong, the row gives the reason and misses its
+target.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,10 +29,11 @@ from cdpipe.core.geometry import Float64Array, invert, make_pose, transform, tra
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import describe_scans, use_threads
 from cdpipe.mapping.mapping import build_map
+from cdpipe.merge.candidates import first_keyframes
 from cdpipe.merge.global_registration import is_kiss_matcher_installed, register_globally
 from cdpipe.merge.merge import merge_maps
 from cdpipe.model.config import PipelineConfig, load_config
-from cdpipe.model.types import MappedSession, PosedScan, ScanSource, SessionName, WrappedScans
+from cdpipe.model.types import DescriptorSet, MappedSession, PosedScan, ScanSource, SessionName, WrappedScans
 from eval.truth.adapters import pipeline_input
 from scenarios.library import load_scenario
 from sim.session.simulate import simulate_pair
@@ -71,11 +74,20 @@ class BenchSession:
         mapped: Its map and descriptors.
         world_T_odom: (K, 4, 4) true pose of its odom frame, as it is at each keyframe.
         descriptor_s: Seconds that the descriptors of all keyframes take, one for each repetition.
+        first_share: Share of the keyframes that are described before the merge.
+        asked: Not empty if a merge was refused with these, and asked for the others.
     """
 
     mapped: MappedSession
     world_T_odom: Float64Array
     descriptor_s: tuple[float, ...]
+    first_share: float = 1.0
+    asked: list[str] = field(default_factory=list)
+
+    def needed_s(self) -> tuple[float, ...]:
+        """Return the seconds of the descriptors that the merges needed."""
+        share = 1.0 if self.asked else self.first_share
+        return tuple(share * each for each in self.descriptor_s)
 
 
 @dataclass(frozen=True)
@@ -121,10 +133,18 @@ class MergeSite:
         held = _ScansInMemory(source, chosen[some].tolist())
         seconds = timed(lambda: describe_scans(held, chosen[some], self.config.descriptor), self.repeats)
         world_T_odom = read_true_poses(pair / name)[chosen] @ invert(point_map.odom_T_keyframe)
+        asked: list[str] = []
+
+        def describe_rest() -> DescriptorSet:
+            asked.append(name)
+            return descriptors
+
         return BenchSession(
-            MappedSession(point_map, descriptors),
+            MappedSession(point_map, descriptors, describe_rest),
             world_T_odom,
             tuple(each * len(chosen) / len(some) for each in seconds),
+            len(first_keyframes(len(chosen), self.config.described_every, name == "after")) / len(chosen),
+            asked,
         )
 
     @cached_property
@@ -245,8 +265,9 @@ def _part(site: MergeSite, name: str) -> tuple[float, ...]:
 
 
 def _all_in(site: MergeSite) -> tuple[float, ...]:
-    parts = [session.descriptor_s for session in site.sessions]
-    return tuple(map(sum, zip(*parts, _part(site, "t_index_s"), _part(site, "t_merge_s"), strict=True)))
+    merges = _part(site, "t_index_s"), _part(site, "t_merge_s")
+    described = [session.needed_s() for session in site.sessions]
+    return tuple(map(sum, zip(*described, *merges, strict=True)))
 
 
 def _raced(site: MergeSite, seconds: tuple[float, ...], target: float, ours: str = "") -> Contest:

@@ -116,8 +116,8 @@ def coarse_merge() -> str:
     return f"matches two samples of a room within {100 * off_m:.0f} cm"
 
 
-def odometry() -> str:
-    """Let a sensor stand still for three revolutions (kiss-icp)."""
+def odometry(name: str = "kiss-icp") -> str:
+    """Let a sensor stand still for three revolutions (kiss-icp, genz-icp)."""
     import numpy as np
 
     from cdpipe.mapping.odometry import estimate_motion
@@ -125,7 +125,7 @@ def odometry() -> str:
 
     sensor = load_profile("os1-32-nominal", "512x10")
     images = [np.full((sensor.height, 512), 5000, dtype=np.uint32)] * 3
-    motion = estimate_motion(images, sensor, np.array([0.0, 0.1, 0.2]), np.arange(512) / 5120.0 - 0.05, np.eye(4))
+    motion = estimate_motion(images, sensor, np.array([0.0, 0.1, 0.2]), np.arange(512) / 5120.0 - 0.05, np.eye(4), name)
     off_m = float(np.abs(motion.points).max())
     _require(off_m < 0.01, f"a sensor that stood still was moved by {off_m:.3f} m")
     return "finds no motion of a sensor that stands still"
@@ -251,6 +251,7 @@ OF_PACKAGE: dict[str, Callable[[], str]] = {
 OF_EXTRA: dict[str, Callable[[], str]] = {
     "ouster": sdk,
     "odometry": odometry,
+    "genz": lambda: odometry("genz-icp"),
     "view": server,
     "kiss": coarse_merge,
     "m3c2": surface_distance,

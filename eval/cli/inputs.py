@@ -28,7 +28,9 @@ Trajectories = Annotated[
         "--trajectory", metavar="FILE", help="poses of the sensor, TUM, KITTI or CSV; once per recording, - for none"
     ),
 ]
-Odometry = Annotated[str | None, typer.Option(metavar="kiss-icp", help="estimate the poses", show_default=False)]
+Odometry = Annotated[
+    str | None, typer.Option(metavar="kiss-icp|genz-icp", help="estimate the poses", show_default=False)
+]
 Metadata = Annotated[
     list[str] | None,
     typer.Option("--metadata", metavar="FILE.json", help="sensor of a .pcap; else the .json beside it"),

@@ -16,6 +16,28 @@ from eval.core.printing import count_pairs, echo, say
 from eval.core.progress import shown_progress
 
 
+def template(
+    file: Annotated[Path, typer.Argument(metavar="FILE.py", help="the new file")],
+    merge: Annotated[
+        Literal["own", "given"], typer.Option(help="`given`: shorter, for `evaluate --merge given` or `ours`")
+    ] = "own",
+    quiet: Quiet = False,
+) -> None:
+    """Write a whole method of some lines, for you to change: what `evaluate` calls."""
+    from shlex import quote
+
+    from eval.leaderboard.templates import write_template
+
+    write_template(file, merge)
+    words, option = (
+        ("{before} {after} {out}", "") if merge == "own" else ("{before} {after} {out} {merge}", " --merge given")
+    )
+    say(
+        quiet,
+        f'tunnelcd evaluate --plan smoke --command "python {quote(str(file))} {words}"{option} --as mine --out bench',
+    )
+
+
 def evaluate(
     plan: Annotated[
         str,

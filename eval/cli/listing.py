@@ -7,14 +7,15 @@ from dataclasses import dataclass
 from textwrap import shorten, wrap
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
-from cdpipe.core.plugins import METHODS, METRICS, entry_points
+from cdpipe.core.plugins import METHODS, METRICS, describe_entry_point, entry_points
 from cdpipe.core.yamlfile import read_yaml
+from cdpipe.methods.registry import describe_method
 from cdpipe.model.config import preset_files, setting_fields
 from cdpipe.sensor.ouster import describe_profile, profile_names
 from eval.graft.adapters import list_adapters
 from eval.plans.files import plan_files, read_plan
 from scenarios import prop_names
-from scenarios.catalogue import family_files
+from scenarios.catalogue import describe_prop, family_files
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -117,17 +118,13 @@ def _one_line(text: object) -> str:
     return (question + mark.strip() if mark else words.partition(". ")[0]).rstrip(".")
 
 
-def _names(read: Callable[[], Iterable[str]]) -> Callable[[], Iterable[Entry]]:
-    return lambda: map(Entry, read())
-
-
 _LISTED: dict[str, Callable[[], Iterable[Entry]]] = {
     "scenarios": _scenarios,
-    "props": _names(prop_names),
+    "props": lambda: (Entry(name, describe_prop(name)) for name in prop_names()),
     "plans": _plans,
     "presets": _presets,
-    "methods": _names(lambda: entry_points(METHODS)),
-    "metrics": _names(lambda: entry_points(METRICS)),
+    "methods": lambda: (Entry(name, describe_method(name)) for name in entry_points(METHODS)),
+    "metrics": lambda: (Entry(name, describe_entry_point(METRICS, name)) for name in entry_points(METRICS)),
     "sensors": lambda: (Entry(name, _one_line(describe_profile(name))) for name in profile_names()),
     "recordings": _recordings,
     "settings": _settings,

@@ -91,6 +91,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "run": commands_run.run_command,
     "merge-runs": commands_run.merge_runs_command,
     "export": commands_run.export,
+    "template": commands_leaderboard.template,
     "evaluate": commands_leaderboard.evaluate,
     "submit": commands_leaderboard.submit,
     "leaderboard": commands_leaderboard.leaderboard,

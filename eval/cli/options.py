@@ -107,6 +107,7 @@ KindOfSite = Annotated[
     Literal["narrow", "wide"],
     typer.Option("--site", help="width of the drifts, for presets with settings for each; `tunnelcd` measures it"),
 ]
+Wide = Annotated[bool, typer.Option("--wide", help="print every column and row, however wide")]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON on standard output instead, for programs")]
 JsonFile = Annotated[
     Path | None, typer.Option("--out", metavar="FILE", help="also write the JSON to this file", show_default=False)

@@ -22,8 +22,8 @@ from eval.cli.inputs import (
     open_sources,
 )
 from eval.cli.options import KindOfSite, OutFolder, Preset, Quiet, SetSettings, require_method_settings
-from eval.cli.printed_answer import LINE, print_answer
-from eval.core.printing import echo, print_table, say, shown_warnings
+from eval.cli.printed_answer import print_answer
+from eval.core.printing import LINE, echo, print_table, say, shown_warnings
 from eval.core.progress import shown_progress
 
 if TYPE_CHECKING:

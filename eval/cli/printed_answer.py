@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eval.core.printing import echo, echo_wrapped, print_table
+from eval.core.printing import LINE, echo, echo_wrapped, print_table
 
 if TYPE_CHECKING:
     from cdpipe.model.report import ChangeReport
-
-LINE = 80
-"""Columns of a terminal."""
 
 
 def print_answer(report: ChangeReport, out: Path, files: Sequence[str], threshold: float) -> None:

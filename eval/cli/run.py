@@ -17,6 +17,7 @@ from eval.cli.options import (
     RunOut,
     Scheduler,
     SetSettings,
+    Wide,
     Workers,
     complete_method,
     complete_plan,
@@ -24,8 +25,8 @@ from eval.cli.options import (
     complete_setting,
     require_method_settings,
 )
-from eval.cli.printed_results import print_comparison, print_results
-from eval.core.printing import echo, print_row, require_json_file, say, tell_json, warn
+from eval.cli.printed_results import print_comparison, print_pair_row, print_results, print_summary
+from eval.core.printing import echo, require_json_file, say, tell_json, warn
 from eval.core.progress import shown_progress
 
 if TYPE_CHECKING:
@@ -89,6 +90,7 @@ def run_command(
         str | None,
         typer.Option(metavar="URL", help="copy rows and answers there as well, and go on from those there"),
     ] = None,
+    wide: Wide = False,
     quiet: Quiet = False,
 ) -> None:
     """Run a plan: scenarios x seeds x variants. Finished cells are kept."""
@@ -109,7 +111,7 @@ def run_command(
     require_reachable(where)
     warn(exposure(where))
     mirror = None if rows_to is None else _open_mirror(rows_to, out)
-    _run(chosen, out, where, force=force, limit=limit, shard=part, keep=keep, mirror=mirror, quiet=quiet)
+    _run(chosen, out, where, force=force, limit=limit, shard=part, keep=keep, mirror=mirror, quiet=quiet, wide=wide)
 
 
 def merge_runs_command(
@@ -118,6 +120,7 @@ def merge_runs_command(
     keep: Annotated[
         Literal["answers", "sessions"], typer.Option(help="`answers`: leave sessions and maps behind")
     ] = "sessions",
+    wide: Wide = False,
     quiet: Quiet = False,
 ) -> None:
     """Unite the run folders of shards, or of parts of a plan, into one. A cell that two hold must be the same."""
@@ -137,7 +140,7 @@ def merge_runs_command(
         found = merge_runs(places, out, command=_command(), keep=keep, names=folders, progress=progress)
     for note in found.notes:
         warn(note)
-    print_results(out, quiet)
+    print_results(out, quiet, wide=wide)
     shared = f", {found.n_shared} of them in several and equal" if found.n_shared else ""
     say(quiet, f"{out}: {found.n_cells} cells of {len(folders)} runs{shared}")
 
@@ -154,6 +157,7 @@ def score(
     ] = None,
     as_json: AsJson = False,
     out: JsonFile = None,
+    wide: Wide = False,
     quiet: Quiet = False,
 ) -> None:
     """Score stored answers against the truth again, or the answers of another program; no method is run."""
@@ -172,7 +176,7 @@ def score(
             row = score(answer, folder)
         tell_json(row, as_json=as_json, file=out)
         if not as_json and not quiet:
-            print_row(row)
+            print_pair_row(row, wide=wide)
         return
     from eval.running.predictions import add_predictions
     from eval.running.rescoring import rescore
@@ -190,7 +194,10 @@ def score(
         tell_json(pd.read_csv(run.path / "results.csv").to_dict("records"), as_json=as_json, file=out)
     if as_json:
         return
-    print_results(run.path, quiet)
+    if wide or quiet:
+        print_results(run.path, quiet, wide=wide)
+    else:
+        print_summary(run.path)
     say(quiet, f"{folder}: {n_scored} {told}, tables rewritten")
 
 
@@ -314,7 +321,7 @@ def _open_mirror(url: str, out: Path) -> Mirror:
     return Mirror(url)
 
 
-def _run(plan: Plan, out: Path, where: Where, *, quiet: bool, **options: Any) -> None:
+def _run(plan: Plan, out: Path, where: Where, *, quiet: bool, wide: bool = False, **options: Any) -> None:
     from eval.plans.plan import expand_cells
     from eval.running.runfolder import removed_if_empty, start_run_folder
     from eval.running.runner import run_plan
@@ -326,7 +333,7 @@ def _run(plan: Plan, out: Path, where: Where, *, quiet: bool, **options: Any) ->
     with removed_if_empty(out), shown_progress(quiet, rate="cells") as progress:
         run = start_run_folder(out)
         outcome = run_plan(plan, run, command=command, where=where, progress=progress, **options)
-    print_results(out, quiet)
+    print_results(out, quiet, wide=wide)
     left = f", {outcome.n_left} left by --limit" if outcome.n_left else ""
     died = f", {outcome.n_died} of all killed their workers" if outcome.n_died else ""
     say(quiet, f"{out}: {outcome.n_done} cells done, {outcome.n_kept} kept from earlier{left}{died}")

@@ -10,8 +10,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from eval.cli.options import AsJson, JsonFile, Quiet, complete_any
-from eval.cli.printed_answer import LINE
-from eval.core.printing import MET, echo, line_width, print_table, require_json_file, tell_json
+from eval.core.printing import LINE, MET, echo, line_width, print_table, require_json_file, tell_json
 
 
 def bench(

@@ -13,7 +13,7 @@ import shutil
 import sys
 import textwrap
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,27 +26,75 @@ from eval.core.output import make_writable, unwritable, whole_file
 
 if TYPE_CHECKING:
     import pandas as pd
+    from rich.table import Table
 
 MET = {True: "met", False: "missed", None: "-"}
 
 
+LINE = 80
+"""Columns of a terminal."""
 # wider than any table: the terminal then wraps long lines, where rich would cut numbers off
-_ANY_WIDTH = 500
+ANY_WIDTH = 500
+_LINES_OF_A_FRAME = 4  # above the headings, the headings, the rule below them, and below the rows
 
 
-def print_table(title: str, frame: pd.DataFrame, columns: int = _ANY_WIDTH) -> None:
+def print_table(title: str, frame: pd.DataFrame, columns: int = ANY_WIDTH) -> None:
     """Print a table under its title, with a dash for NaN and None; cells are folded where it has too few columns."""
-    from rich import box
     from rich.console import Console
+
+    Console(width=columns, markup=False, emoji=False).print(_as_table(title, frame, columns))
+
+
+def print_fitted(title: str, frame: pd.DataFrame, gives_way: Sequence[Sequence[str]], max_lines: int = 0) -> list[str]:
+    """Print of a table what a terminal has room for.
+
+    Args:
+        title: Stands above it.
+        frame: The whole table.
+        gives_way: Groups of its columns that are left out where not all fit, the first group first. Others are folded.
+        max_lines: Rows at the end are left out and counted beyond so many lines; 0 for no limit.
+
+    Returns:
+        The names of the columns left out.
+    """
+    left_out: list[str] = []
+    for group in gives_way:
+        if not _is_folded(frame):
+            break
+        names = [name for name in group if name in frame.columns]
+        frame = frame.drop(columns=names)
+        left_out += names
+    n_rows = min(len(frame), max_lines or len(frame))
+    while max_lines and n_rows and _height(title, frame[:n_rows]) > max_lines - (n_rows < len(frame)):
+        n_rows -= 1
+    print_table(title, frame[:n_rows], LINE)
+    if n_rows < len(frame):
+        echo(f"and {len(frame) - n_rows} more rows")
+    return left_out
+
+
+def _as_table(title: str, frame: pd.DataFrame, columns: int) -> Table:
+    from rich import box
     from rich.table import Table
 
-    is_narrow = columns < _ANY_WIDTH
+    is_narrow = columns < ANY_WIDTH
     table = Table(title=visible(title), title_justify="left", box=box.SIMPLE_HEAD, collapse_padding=is_narrow)
     for name in frame.columns:
         table.add_column(visible(str(name)), no_wrap=not is_narrow, overflow="fold")
     for row in frame.itertuples(index=False):
         table.add_row(*(_cell(value) for value in row))
-    Console(width=columns, markup=False, emoji=False).print(table)
+    return table
+
+
+def _is_folded(frame: pd.DataFrame) -> bool:
+    """Return whether a terminal has too few columns for a table: a cell or a heading takes more than one line."""
+    return _height("", frame) > len(frame) + _LINES_OF_A_FRAME
+
+
+def _height(title: str, frame: pd.DataFrame) -> int:
+    from rich.console import Console
+
+    return len(Console(width=LINE, markup=False).render_lines(_as_table(title, frame, LINE), pad=False))
 
 
 def print_row(row: dict[str, Any]) -> None:
@@ -64,7 +112,7 @@ def echo(*lines: str, err: bool = False) -> None:
 
 def line_width() -> int:
     """Return the columns of the terminal; where standard output is none, as many as any line needs."""
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else _ANY_WIDTH
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else ANY_WIDTH
 
 
 def echo_json(value: Any) -> None:

@@ -33,10 +33,9 @@ _MERGES = {"own": "its own", "given": "told the true one", "ours": "told tunnelc
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """A cell of the page: its text, what it is sorted by, and its interval."""
+    """A cell of the page: its text and its interval."""
 
     text: str
-    key: str
     interval: str = ""
 
 
@@ -126,13 +125,11 @@ def _list_references(data: RunData | None, pairs: pd.Index[Any]) -> Iterator[tup
 
 
 def _line(row: dict[str, Any], merge: str, is_reference: bool) -> Line:
-    answered = Shown(f"{row['n_answered']}/{row['n_pairs']}", str(row["n_answered"] / row["n_pairs"]))
+    answered = Shown(f"{row['n_answered']}/{row['n_pairs']}")
     figures = [
-        Shown(show_figure(key, row[key]), _sort_key(row[key]), show_span(key, row[f"{key}_low"], row[f"{key}_high"]))
-        for key in FIGURES
+        Shown(show_figure(key, row[key]), show_span(key, row[f"{key}_low"], row[f"{key}_high"])) for key in FIGURES
     ]
-    name = Shown(row["method"], row["method"].casefold())
-    return Line((name, Shown(merge, merge), answered, *figures), is_reference)
+    return Line((Shown(row["method"]), Shown(merge), answered, *figures), is_reference)
 
 
 def _notes(
@@ -158,7 +155,3 @@ def _notes(
 
 def _rank(value: float) -> float:
     return -math.inf if math.isnan(value) else value
-
-
-def _sort_key(value: float) -> str:
-    return "" if math.isnan(value) else repr(value)

@@ -16,7 +16,7 @@ from eval.core.output import whole_file
 
 _FILES = (
     "page.html", "index.html", "comparison.html", "answer.html", "story.html", "leaderboard.html", "parts.html",
-    "page.css", "parts.css", "page.js", "charts.js", "answer.js", "sort.js",
+    "page.css", "parts.css", "page.js", "charts.js", "answer.js",
 )  # fmt: skip
 
 

@@ -44,6 +44,7 @@ def name_result(stage: Stage, config: PipelineConfig) -> str:
                 "method": config.descriptor.method,
                 "weights": checkpoint_digest(config.descriptor),
                 **({"airborne": "drop"} if config.map.airborne == "drop" else {}),
+                **({"every": config.described_every} if config.described_every > 1 else {}),
             }
         case "spheres":
             precision, weights = config.descriptor.precision, sphere_digest(config.sphere)

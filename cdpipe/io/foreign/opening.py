@@ -28,7 +28,7 @@ from cdpipe.io.foreign.trajectory import Trajectory, poses_at, read_poses, requi
 from cdpipe.io.foreign.whole_map import MapStations
 from cdpipe.io.ply import write_ply_points
 from cdpipe.io.tum import write_tum
-from cdpipe.mapping.odometry import estimate_cloud_motion
+from cdpipe.mapping.odometry import ODOMETRIES, estimate_cloud_motion
 from cdpipe.mapping.pose_check import check_quaternion_order
 from cdpipe.model.types import PosedScan
 
@@ -46,7 +46,7 @@ class HowToRead:
         format: Name in `FORMATS`.
         topics: Topics of a bag, of its clouds and of its poses.
         trajectory: File of the sensor's poses.
-        odometry: "kiss-icp" estimates the poses.
+        odometry: "kiss-icp" or "genz-icp" estimates the poses.
         metadata: The .json of a PCAP's sensor.
         deskew: Whether points that have times are deskewed; False where they are already.
     """
@@ -61,8 +61,8 @@ class HowToRead:
     def __post_init__(self) -> None:
         if self.format is not None:
             require_format_name(self.format)
-        if self.odometry not in (None, KISS_ICP):
-            raise InputError(f"--odometry {self.odometry}: expected {KISS_ICP}")
+        if self.odometry is not None and self.odometry not in ODOMETRIES:
+            raise InputError(f"--odometry {self.odometry}: expected {' or '.join(ODOMETRIES)}")
         if self.odometry is not None and self.trajectory is not None:
             raise InputError("--trajectory and --odometry both give the poses: leave one out")
 
@@ -227,7 +227,8 @@ def _lacking(trajectory: Trajectory, stamps_s: Float64Array | None) -> str:
 
 
 def _estimate(clouds: Clouds, how: HowToRead, report: Progress) -> _Posed:
-    require_extra("odometry", f"--odometry {how.odometry}")
+    odometry = str(how.odometry)
+    require_extra(ODOMETRIES[odometry], f"--odometry {odometry}")
     n_scans = len(clouds)
     stamps_s = clouds.stamps_s if clouds.stamps_s is not None else _nominal_s(n_scans)
 
@@ -240,8 +241,8 @@ def _estimate(clouds: Clouds, how: HowToRead, report: Progress) -> _Posed:
         report("odometry", n_scans, n_scans)
 
     try:
-        poses = estimate_cloud_motion(frames(), stamps_s)
+        poses = estimate_cloud_motion(frames(), stamps_s, odometry)
     except InputError as error:
         raise InputError(f"{clouds.name}: {error}: give the poses with --trajectory") from error
     motion = Trajectory("", poses, stamps_s).motion() if how.deskew else None
-    return _Posed(clouds, poses, stamps_s, motion, KISS_ICP)
+    return _Posed(clouds, poses, stamps_s, motion, odometry)

@@ -4,7 +4,8 @@ Sources of the poses:
 
 - `own`: an OSF has a pose for each column (`body_to_world`, with the sensor's mounting `sensor_to_body`);
 - a TUM file of `odom_T_sensor` with stamps of the sensor's clock, interpolated to every column;
-- `kiss-icp`: one pose per revolution at its middle column, interpolated; the odom frame is the first sensor frame.
+- `kiss-icp`, `genz-icp`: one pose per revolution at its middle column, interpolated; the odom frame is the first
+  sensor frame.
 
 Both returns of a beam are kept. A missing column has no returns and an interpolated stamp and pose.
 """
@@ -29,7 +30,7 @@ from cdpipe.io.ouster.beams import check_beams
 from cdpipe.io.ouster.captures import Progress, Recording, Revolution, open_recording
 from cdpipe.io.session import ScanChunk, SessionWriter, fit_chunk
 from cdpipe.io.tum import motion_along
-from cdpipe.mapping.odometry import estimate_motion
+from cdpipe.mapping.odometry import ODOMETRIES, estimate_motion
 
 KISS_ICP = "kiss-icp"
 _OWN_POSE_TOLERANCE = 1e-9
@@ -81,18 +82,18 @@ def import_recording(
         metadata: The sensor's metadata .json of a PCAP; default: the file of the same name next to it.
         trajectory: TUM, KITTI or CSV file with the sensor's poses, which replaces the recording's own. Without times
             it has one pose for each revolution, at its first column.
-        odometry: "kiss-icp" estimates the poses instead.
+        odometry: "kiss-icp" or "genz-icp" estimates the poses instead.
         on_progress: Called with the stage, the number of finished revolutions and their estimated total.
 
     Raises:
         InputError: A file cannot be used, `out` exists, or there are no poses.
     """
-    if odometry not in (None, KISS_ICP):
-        raise InputError(f"--odometry {odometry}: expected {KISS_ICP}")
+    if odometry is not None and odometry not in ODOMETRIES:
+        raise InputError(f"--odometry {odometry}: expected {' or '.join(ODOMETRIES)}")
     if odometry is not None and trajectory is not None:
         raise InputError("--trajectory and --odometry both give the poses: leave one out")
     if odometry is not None:
-        require_extra("odometry", f"--odometry {odometry}")
+        require_extra(ODOMETRIES[odometry], f"--odometry {odometry}")
     report = on_progress or (lambda stage, done, total: None)
     recording = open_recording(source, metadata)
     times = _read_times(recording, report)
@@ -151,7 +152,7 @@ def _choose_motion(
         images = _range_images(recording, len(times.first_ns), report)
         try:
             middle_s = (times.middle_ns - start_ns) / 1e9
-            return estimate_motion(images, recording.sensor, middle_s, column_s, make_pose()), odometry
+            return estimate_motion(images, recording.sensor, middle_s, column_s, make_pose(), odometry), odometry
         except InputError as error:
             raise InputError(f"{recording.path}: {error}: give the poses with --trajectory") from error
     # the first revolution may be at the origin of the pose frame, which looks like a missing pose

@@ -66,7 +66,7 @@ def read_content(before: Path | ScanSource, after: Path | ScanSource, folder: Pa
         raise InputError(f"{folder}: the method gave no answer ({why}): view the sessions one by one")
     first, second = (open_session(each) if isinstance(each, Path) else each for each in (before, after))
     sessions = first, second
-    return gather_content(sessions, answer.method, _with_points(answer, sessions), on_stage)
+    return gather_content(sessions, answer.method, locate_objects(answer, sessions), on_stage)
 
 
 def gather_content(
@@ -98,7 +98,7 @@ def near_stretches(is_near: BoolArray, *, wanted: bool) -> Iterator[slice]:
         yield slice(start, end + 1)
 
 
-def _with_points(answer: Answer, sessions: tuple[ScanSource, ScanSource]) -> ChangeReport:
+def locate_objects(answer: Answer, sessions: tuple[ScanSource, ScanSource]) -> ChangeReport:
     """Return the report of an answer, the map points of its objects from its odom points or returns if it has none."""
     report = answer.report
     assert report is not None

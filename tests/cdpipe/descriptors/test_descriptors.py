@@ -9,6 +9,7 @@ import torch
 
 from cdpipe.core.errors import InputError
 from cdpipe.descriptors import describe_scan, describe_scans, load_descriptors, relative_yaws_rad, save_descriptors
+from cdpipe.descriptors.describe import _BATCH, insert_rows
 from cdpipe.descriptors.network import DIMENSIONS, make_untrained_network, yaw_correlation
 from cdpipe.descriptors.range_image import COLUMNS, ELEVATION_RAD, ROWS, range_image
 from cdpipe.model.config import DescriptorConfig, MapConfig
@@ -225,3 +226,28 @@ def test_scores_of_a_perfect_and_a_blind_network() -> None:
 
     # every before keyframe looks alike, the first is taken: 1 of 8 places is right
     assert evaluate(Blind(), data)["recall_at_1"] == pytest.approx(1 / 8)
+
+
+def test_some_keyframes_first_and_the_others_later_are_all_of_them() -> None:
+    config, scans, rows = DescriptorConfig(method="solid"), np.array([0, 3, 4, 7]), np.array([0, 2])
+    whole = describe_scans(_Source(), scans, config)
+    first = insert_rows(describe_scans(_Source(), scans[rows], config), rows, scans)
+    np.testing.assert_array_equal(first.q[rows], whole.q[rows])
+    assert not first.q[[1, 3]].any() and first.w is not None and not first.w[[1, 3]].any()
+    others = np.array([1, 3])
+    both = insert_rows(describe_scans(_Source(), scans[others], config), others, scans, first)
+    np.testing.assert_array_equal(both.q, whole.q)
+    np.testing.assert_array_equal(both.w, whole.w)
+    np.testing.assert_array_equal(both.keyframe_scans, scans)
+    assert (both.name, both.checkpoint) == (whole.name, whole.checkpoint)
+    assert not first.q[[1, 3]].any()  # the known ones are not overwritten
+
+
+def test_batches_change_no_vector() -> None:
+    scans = np.arange(2 * _BATCH + 9)  # two batches, and a smaller one
+    made = describe_scans(_Source(), scans, DescriptorConfig())
+    for index in (0, _BATCH, len(scans) - 1):
+        q, w = describe_scan(_Source().scan(index), DescriptorConfig())
+        np.testing.assert_allclose(made.q[index], q, atol=1e-5)
+        assert made.w is not None
+        np.testing.assert_allclose(made.w[index], w, atol=1e-5)

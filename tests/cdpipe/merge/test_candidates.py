@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import Float64Array, invert, transform, yaw_pose
-from cdpipe.merge.candidates import Candidate, _fit_common_motion, count_votes, find_candidates, find_closest_pair
+from cdpipe.merge.candidates import (
+    Candidate,
+    _fit_common_motion,
+    count_votes,
+    find_candidates,
+    find_closest_pair,
+    first_keyframes,
+)
 from cdpipe.model.config import MergeConfig
 from cdpipe.model.types import MappedSession
 
@@ -120,3 +127,41 @@ def test_no_descriptor_no_candidate(tunnel_before: MappedSession) -> None:
     empty = MappedSession(tunnel_before.map, nothing)
     assert find_candidates(tunnel_before, empty, MergeConfig()) == []
     assert find_closest_pair(empty, tunnel_before) == []
+
+
+@pytest.mark.parametrize("n", [0, 1, 9, 10, 57, 400])
+def test_what_is_compared_first_is_spread_over_the_session(n: int) -> None:
+    before, after = (first_keyframes(n, 4, is_after) for is_after in (False, True))
+    for chosen in (before, after):
+        assert min(n, 10) <= len(chosen) <= n
+        assert (np.diff(chosen) > 0).all() and (n == 0 or chosen[0] == 0)
+    assert (np.diff(before) <= 4).all() and (np.diff(after) <= 8).all()
+    assert len(before) <= max(20, n / 4 + 1) and len(after) <= max(20, n / 8 + 1)
+
+
+def test_no_more_after_keyframes_are_queried_than_are_compared_first() -> None:
+    assert len(first_keyframes(5000, 4, True)) == 100
+    np.testing.assert_array_equal(first_keyframes(7, 1, False), np.arange(7))
+    assert len(first_keyframes(5000, 1, True)) == 100 and len(first_keyframes(5000, 1, False)) == 5000
+
+
+def test_candidates_are_of_the_keyframes_compared_first(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array
+) -> None:
+    sessions = tunnel_before, tunnel_after
+    rows = [
+        first_keyframes(len(each.descriptors.q), 2, is_after)
+        for each, is_after in zip(sessions, (False, True), strict=True)
+    ]
+    # the other vectors must not count: without them the candidates are the same
+    blank = []
+    for session, kept in zip(sessions, rows, strict=True):
+        q, w = np.zeros_like(session.descriptors.q), np.zeros_like(session.descriptors.q)
+        assert session.descriptors.w is not None and len(kept) < len(q)
+        q[kept], w[kept] = session.descriptors.q[kept], session.descriptors.w[kept]
+        blank.append(MappedSession(session.map, replace(session.descriptors, q=q, w=w)))
+    found, of_blank = (find_candidates(*each, MergeConfig(n_candidates=4), every=2) for each in (sessions, blank))
+    assert path_miss_m(found[0], true_before_T_after, tunnel_after) < 1.0
+    assert {each.before_keyframe for each in found} <= set(rows[0].tolist())
+    for one, other in zip(found, of_blank, strict=True):
+        np.testing.assert_array_equal(one.before_T_after, other.before_T_after)

@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +13,12 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputWarning
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.io.ply import read_ply_points
+from cdpipe.merge import merge
+from cdpipe.merge.candidates import first_keyframes
 from cdpipe.merge.evidence import explain_refusal
 from cdpipe.merge.global_registration import is_kiss_matcher_installed
 from cdpipe.merge.merge import merge_maps, take_known_merge
-from cdpipe.merge.registration import register
+from cdpipe.merge.registration import IndexedMap, register
 from cdpipe.model.config import MergeConfig, load_config
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps
 from cdpipe.pipeline import detect
@@ -63,6 +66,69 @@ def test_the_true_transform_is_found(
     assert merged.evidence["n_hypotheses"] == 1
     assert merged.evidence["is_fallback"] == 0
     assert set(merged.seconds) == {"t_index_s", "t_merge_s", "t_refine_s"}
+
+
+def test_a_long_map_is_indexed_where_it_is_looked_at(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = CONFIG.model_copy(update={"refine": "none", "first_every": 2})
+    whole = merge_maps(tunnel_before, tunnel_after, config)
+    made: list[IndexedMap] = []
+
+    class Recorded(IndexedMap):
+        def __init__(self, *args: Any, **settings: Any) -> None:
+            super().__init__(*args, **settings)
+            made.append(self)
+
+    monkeypatch.setattr(merge, "IndexedMap", Recorded)
+    monkeypatch.setattr(merge, "_LONG_M", 1.0)
+    merged = merge_maps(tunnel_before, tunnel_after, config)
+    assert merged.is_accepted and whole.is_accepted
+    assert map_error_m(merged.before_T_after, whole.before_T_after, tunnel_after.map.points) < 1e-3
+    assert merged.evidence == pytest.approx(whole.evidence, rel=1e-2)
+    before, after = made
+    assert before.local_s > 0 and after.local_s > 0
+    with pytest.raises(ValueError, match="not indexed as a target"):
+        _ = before.target  # the whole was never indexed
+    # far off the map the nearest point may be anywhere
+    nearest, squared_m2 = after.nearest_near(np.full(3, 500.0), 1.0, np.full((1, 3), 500.0))
+    apart_m = np.linalg.norm(after.points - 500.0, axis=1)
+    np.testing.assert_allclose(np.sqrt(squared_m2), apart_m.min())
+    np.testing.assert_array_equal(nearest[0], after.points[apart_m.argmin()])
+    merge_maps(tunnel_before, tunnel_after, CONFIG.model_copy(update={"refine": "none"}))
+    assert made[2].target is not None and made[2].local_s == 0.0  # as published: at once
+
+
+def test_the_other_keyframes_are_described_only_after_a_refusal(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array
+) -> None:
+    config = CONFIG.model_copy(update={"refine": "none", "first_every": 3})
+    asked: list[str] = []
+
+    def first_only(session: MappedSession, name: str, *, is_after: bool, is_wrong: bool = False) -> MappedSession:
+        whole, q = session.descriptors, np.zeros_like(session.descriptors.q)
+        rows = first_keyframes(len(q), config.first_every, is_after)
+        q[rows] = whole.q[rows[::-1]] if is_wrong else whole.q[rows]
+
+        def rest() -> DescriptorSet:
+            asked.append(name)
+            return whole
+
+        return MappedSession(session.map, replace(whole, q=q), rest)
+
+    before = first_only(tunnel_before, "before", is_after=False)
+    merged = merge_maps(before, first_only(tunnel_after, "after", is_after=True), config)
+    assert merged.is_accepted and asked == []
+    assert map_error_m(merged.before_T_after, true_before_T_after, tunnel_after.map.points) < 0.1
+    # the same from the vectors of all keyframes: laziness changes nothing
+    known = merge_maps(tunnel_before, tunnel_after, config)
+    np.testing.assert_array_equal(known.before_T_after, merged.before_T_after)
+    # where the first keyframes mislead, all decide, as if none had been compared first
+    misled = merge_maps(before, first_only(tunnel_after, "after", is_after=True, is_wrong=True), config)
+    assert misled.is_accepted and asked == ["before", "after"]
+    at_once = merge_maps(tunnel_before, tunnel_after, config.model_copy(update={"first_every": 1}))
+    np.testing.assert_array_equal(misled.before_T_after, at_once.before_T_after)
+    assert misled.evidence["n_hypotheses"] > at_once.evidence["n_hypotheses"]
 
 
 def test_without_refinement_one_transform_holds_everywhere(
@@ -295,6 +361,25 @@ def test_a_standing_sensor_is_merged_by_what_there_is(n_scans: int) -> None:
     assert path_error_m(take_known_merge(before, after, off, CONFIG), true) < 0.02
     as_it_is = take_known_merge(before, after, off, CONFIG.model_copy(update={"refine": "none"}))
     np.testing.assert_array_equal(as_it_is.before_T_after, off)
+
+
+def test_a_short_recording_of_single_rings_is_refused_and_a_known_merge_of_it_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    before, after = stand(30.0, 0, np.eye(4)), stand(30.6, 1, AFTER_ODOM_T_WORLD)
+    assert merge_maps(before, after, CONFIG).evidence["line_share"] < 0.05
+    monkeypatch.setattr("cdpipe.merge.rings.MAX_LINE_SHARE", -1.0)  # as if these were rings
+    merged = merge_maps(before, after, CONFIG)
+    assert not merged.is_accepted and "line_share" in merged.reason
+    assert merge_maps(before, after, CONFIG.model_copy(update={"accept_all": True})).is_accepted
+    off = make_pose(translation=(0.2, 0.1, 0.0)) @ invert(AFTER_ODOM_T_WORLD)
+    known = take_known_merge(before, after, off, CONFIG)
+    assert known.is_accepted
+    np.testing.assert_array_equal(known.before_T_after, off)
+
+
+def test_a_long_path_is_not_asked_for_rings(tunnel_before: MappedSession, tunnel_after: MappedSession) -> None:
+    assert "line_share" not in merge_maps(tunnel_before, tunnel_after, CONFIG).evidence
 
 
 def test_a_standing_sensor_finds_its_place_in_a_drive(tunnel_before: MappedSession) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from cdpipe.core.geometry import Float64Array, transform
 from cdpipe.model.types import MergedMaps
-from cdpipe.surface.cells import CELL_M, N_FOLDS, NearReturns, make_cells, near_returns
+from cdpipe.surface.cells import CELL_M, N_FOLDS, NearReturns, make_cells, near_returns, number_cells
 from cdpipe.surface.motions import PathMotions
 from tests.cdpipe.rooms import RoomScans
 
@@ -96,3 +96,24 @@ def test_threads_change_nothing(
     again = near_returns(merged, "before")
     assert np.array_equal(again.points, returns.points)
     assert np.array_equal(make_cells(again).fold_offsets, make_cells(returns).fold_offsets, equal_nan=True)
+
+
+def test_stretches_are_put_together_in_order(
+    merged: MergedMaps, returns: NearReturns, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cdpipe.surface.cells._STRETCHES", 2)
+    again = near_returns(merged, "before")
+    assert np.array_equal(again.points, returns.points)
+    assert np.array_equal(again.cell_of, returns.cell_of)
+
+
+def test_without_folds_the_cells_are_the_same(returns: NearReturns) -> None:
+    cells, folded = make_cells(returns, with_folds=False), make_cells(returns)
+    assert np.allclose(cells.points, folded.points, atol=1e-12)
+    assert cells.fold_offsets.shape == (len(folded.points), 1, 3)
+
+
+def test_cells_are_numbered_by_their_keys() -> None:
+    keys = np.array([7, 7, -2, 40, 7, -2])
+    assert number_cells(keys).tolist() == [1, 1, 0, 2, 1, 0]
+    assert number_cells(keys[:0]).shape == (0,)

@@ -21,6 +21,7 @@ from tests.cdpipe.surface.tunnels import (
     about_axis_deg,
     is_inner,
     left_wall,
+    single_returns,
     surveyed,
     true_displacement,
     tunnel,
@@ -110,6 +111,58 @@ def test_a_change_of_a_third_of_the_round_is_not_absorbed(survey: Survey) -> Non
     inner = np.abs(survey[1].points[:, 0] - 6.0) < 5.5
     assert found.displacement_m[inner & (from_wall_deg < 45.0)].mean() == pytest.approx(0.02, abs=1.5e-3)
     assert found.displacement_m[inner & (from_wall_deg > 75.0)].mean() == pytest.approx(0.0, abs=1.5e-3)
+
+
+@pytest.mark.parametrize("width_deg", [120.0, 180.0])
+def test_a_roof_that_came_down_over_half_of_the_round_is_not_absorbed(survey: Survey, width_deg: float) -> None:
+    def roof(x_m: Float64Array, angle_deg: Float64Array) -> Float64Array:
+        return np.where(np.abs(angle_deg) < width_deg / 2, 0.01, 0.0)
+
+    found = measure(survey, tunnel(2, roof))
+    from_edge_deg = np.abs(about_axis_deg(survey[1].points)) - width_deg / 2
+    inner = np.abs(survey[1].points[:, 0] - 6.0) < 5.5
+    assert found.displacement_m[inner & (from_edge_deg < -15.0)].mean() == pytest.approx(0.01, abs=1e-3)
+    assert found.displacement_m[inner & (from_edge_deg > 15.0)].mean() == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_convergence_all_round_is_not_absorbed_and_its_level_says_how_unsure_it_is(survey: Survey) -> None:
+    """No rigid motion explains it, but nothing stands still: the alignment is as unsure as the offsets are large."""
+    found = measure(survey, tunnel(2, lambda x_m, angle_deg: np.full(len(x_m), 0.02)))
+    still = measure(survey, tunnel(2))
+    inner = np.abs(survey[1].points[:, 0] - 6.0) < 5.5
+    error_m = np.abs(found.displacement_m - 0.02)[inner]
+    assert np.mean(error_m <= found.level_m[inner]) > 0.95
+    assert (found.displacement_m > found.level_m)[inner].mean() > 0.95
+    assert np.median(found.level_m[inner]) > 2 * np.median(still.level_m[inner])
+
+
+def wire_before_rock(sample: int, share: float) -> NearReturns:
+    """The tunnel with wire 60 mm before the rock of its left wall; a share of the returns there comes from the wire."""
+    rock = tunnel(sample)
+    angle_deg = about_axis_deg(rock.points)
+    is_wire = (np.abs(angle_deg - 90.0) < 30.0) & (np.abs(rock.points[:, 0] - 6.0) < 3.0)
+    is_wire &= stream(sample, "wire").random(len(angle_deg)) < share
+    points = rock.points * np.where(is_wire[:, None], [1.0, 1 - 0.06 / RADIUS_M, 1 - 0.06 / RADIUS_M], 1.0)
+    return single_returns(points, rock.path_m, rock.weights)
+
+
+def test_sessions_that_see_other_shares_of_wire_and_rock_find_no_region() -> None:
+    """The means differ by centimetres where nothing moved. The level says so, and neighbours share it."""
+    survey = surveyed(wire_before_rock(1, 0.35))
+    found = measure(survey, wire_before_rock(2, 0.5))
+    places, settings = survey[1], load_config("tunnelcd").surface
+    behind = (np.abs(about_axis_deg(places.points) - 90.0) < 25.0) & (np.abs(places.points[:, 0] - 6.0) < 2.5)
+    assert np.mean(np.abs(found.along_m[behind]) <= found.level_m[behind]) > 0.9
+    beside = is_inner(places) & (np.abs(about_axis_deg(places.points) - 90.0) > 45.0)
+    assert np.median(found.level_m[beside]) < 0.003 < 3 * 0.003 < np.median(found.level_m[behind])
+
+    def regions(shared_m: Float64Array | float) -> int:
+        return len(
+            group_regions(places, found.along_m, found.level_m, settings.spacing_m, settings.least_m,
+                          settings.least_area_m2, shared_m=shared_m)[1]
+        )  # fmt: skip
+
+    assert regions(found.shared_m) == 0
 
 
 def wall_ring(x_m: float) -> Float64Array:

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, make_pose, stream
-from cdpipe.surface.cells import NearReturns, SurfaceCells, make_cells, number_cells
+from cdpipe.core.voxel import cell_keys
+from cdpipe.surface.cells import CELL_M, NearReturns, SurfaceCells, make_cells, number_cells
 from cdpipe.surface.places import SurfacePlaces, choose_places
 from cdpipe.surface.unrolled import unroll
 
@@ -50,7 +51,8 @@ def tunnel(sample: int, moved: Moved = nowhere, noise_m: float = NOISE_M, stretc
 
 def single_returns(points: Float64Array, path_m: Float64Array, weights: Float64Array) -> NearReturns:
     """Near returns of which none are averaged."""
-    return NearReturns(points, path_m, weights, np.ones(len(points), dtype=np.int64), number_cells(points), PATH)
+    cell_of = number_cells(cell_keys(points, CELL_M))
+    return NearReturns(points, path_m, weights, np.ones(len(points), dtype=np.int32), cell_of, PATH)
 
 
 def surveyed(returns: NearReturns) -> tuple[SurfaceCells, SurfacePlaces, Float64Array]:

@@ -75,12 +75,17 @@ def test_rows_of_descriptors_and_query(site: MergeSite) -> None:
 
 
 def test_all_in_is_descriptors_index_and_merge(site: MergeSite) -> None:
-    described = [replace(session, descriptor_s=(1.0, 3.0)) for session in site.sessions]
+    described = [replace(each, descriptor_s=(1.0, 3.0), first_share=1.0, asked=[]) for each in site.sessions]
     fixed = replace(site)  # the same pair, none of its times
     fixed.__dict__.update(sessions=tuple(described), raced=([PARTS, PARTS], [9.0, 9.0]), rival=("told", True))
     row = make_row("all-in", dict(merge_contests(fixed))["merge-tiny-all-in"]())
     # 1 + 1 + 2 + 0.5 and 3 + 3 + 2 + 0.5
     assert (row["value"], row["rival_value"], row["spread"]) == (6.5, 9.0, 2.0)
+    # half of the keyframes sufficed; then one session had to describe all
+    fixed.__dict__["sessions"] = tuple(replace(each, first_share=0.5) for each in described)
+    assert make_row("all-in", dict(merge_contests(fixed))["merge-tiny-all-in"]())["value"] == 4.5
+    fixed.__dict__["sessions"][0].asked.append("before")
+    assert make_row("all-in", dict(merge_contests(fixed))["merge-tiny-all-in"]())["value"] == 5.5
 
 
 @needs_kiss_matcher

@@ -58,6 +58,13 @@ def test_names_come_with_a_line_each(command: Command, kind: str, names: Callabl
     assert all(row["description"] and "\n" not in row["description"] for row in found)
 
 
+@pytest.mark.parametrize("kind", ["props", "methods"])
+def test_each_prop_and_method_has_a_line_of_its_own(command: Command, kind: str) -> None:
+    rows = json.loads(command("list", kind, "--json")[1])
+    assert len(rows) > 10 and len({row["description"] for row in rows}) == len(rows)
+    assert all(20 < len(row["description"]) < 120 for row in rows)
+
+
 @pytest.mark.parametrize("kind", ["presets", "sensors"])
 def test_presets_and_sensors_are_described(command: Command, kind: str) -> None:
     rows = json.loads(command("list", kind, "--json")[1])

@@ -11,7 +11,7 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from eval.core.exits import input_errors
-from eval.core.printing import print_row, print_table, say
+from eval.core.printing import LINE, print_fitted, print_row, print_table, say
 from eval.core.progress import Bars, Lines
 
 Command = Callable[..., tuple[int, str, str]]
@@ -30,6 +30,20 @@ def test_tables_and_rows(capsys: pytest.CaptureFixture[str]) -> None:
     say(False, HOSTILE)
     out = capsys.readouterr().out
     assert is_harmless(out) and out.count(SHOWN) == 6
+
+
+def test_a_table_is_fitted_into_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    table = pd.DataFrame({name: ["0123456789"] * 40 for name in "abcdefgh"})
+    # a column takes 10 letters and 2 blanks, and the frame 2: six columns fit into 80
+    assert print_fitted("title", table, [("e", "x"), ("b", "c"), ("d",)], max_lines=20) == ["e", "b", "c"]
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= LINE and len(lines) == 20
+    assert lines[2].split() == ["a", "d", "f", "g", "h"]
+    assert lines[-1] == f"and {40 - sum('0123456789' in line for line in lines)} more rows"
+    # what cannot be left out is folded, and nothing is cut
+    assert print_fitted("title", pd.DataFrame({"a": ["x" * 100], "b": [1]}), [("b",)]) == ["b"]
+    assert capsys.readouterr().out.count("x") == 100
+    assert print_fitted("title", table[list("abc")], [("a",)]) == []
 
 
 def test_progress(capsys: pytest.CaptureFixture[str]) -> None:

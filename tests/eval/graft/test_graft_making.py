@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from cdpipe.core.errors import InputError
@@ -143,6 +144,24 @@ def test_the_command_line(simulated: Path, tmp_path: Path, command: Command) -> 
     read = [(tmp_path / name / "after" / "chunks" / "00000.npz").read_bytes() for name in ("pair", "simulated")]
     assert read[0] == read[1]
     assert command("view", own, "--html", tmp_path / "v.html")[0] == 2
+
+
+def test_a_plan_names_the_file_of_a_recording(
+    simulated: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "recordings").mkdir()
+    (tmp_path / "recordings" / "drive").symlink_to(simulated / "before")
+    (tmp_path / "own.yaml").write_text(
+        "recording: {sessions: [recordings/drive], reach_m: 4, clearance_m: 0.5}\n"
+        "props:\n  - {name: box, kind: box, size_m: [0.8, 0.6, 0.7], change: added}\n"
+    )
+    plan = tmp_path / "plan.yaml"
+    plan.write_text(f"name: drive\nscenarios: [own.yaml]\nseeds: [{SEED}]\nvariants: [{{preset: random-regions}}]\n")
+    code, _, err = command("run", plan, "--out", tmp_path / "run")
+    assert code == 0, err
+    (row,) = pd.read_csv(tmp_path / "run" / "results.csv").to_dict("records")
+    assert (row["scenario"], row["status"], row["n_observable"]) == ("own.yaml", "ok", 1)
 
 
 @pytest.mark.parametrize(

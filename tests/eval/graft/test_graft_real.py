@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cdpipe.core.errors import MergeFailedError
 from cdpipe.io.session import read_session
 from cdpipe.pipeline import detect
 from eval.scoring import score
@@ -80,9 +81,10 @@ def test_ten_revolutions_of_an_os0_8(command: Callable[..., Any], tmp_path: Path
     pytest.importorskip("kiss_icp", reason="pip install 'tunnelcd[odometry]'")
     changed, null = graft_both(command, tmp_path, OSF_8, "--odometry", "kiss-icp")
     require_exact(changed, null)
-    # eight beams: rings of the sensor match rings, and the search for the merge slips by one revolution's step
-    known = {"merge.refine": "none"}
-    report = detect(null / "before", null / "after", "tunnelcd", known, before_T_after=np.eye(4))
+    # eight beams: rings match rings, and a registration slips by one revolution's step, 0.49 m: it is refused
+    with pytest.raises(MergeFailedError, match="line_share"):
+        detect(null / "before", null / "after", "tunnelcd")
+    report = detect(null / "before", null / "after", "tunnelcd", before_T_after=np.eye(4))
     found = score(report, null)
     assert found["merge_error_m"] < 1e-9
     assert found["false_regions_per_100m"] == 0

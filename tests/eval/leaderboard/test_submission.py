@@ -226,6 +226,7 @@ def test_the_page_shows_every_file_escaped(packed: Path, tmp_path: Path) -> None
     page = (tmp_path / "out" / "board.html").read_text()
     assert "&lt;script&gt;alert(1)" in page and "<script>alert" not in page and "\x1b" not in page
     assert page.count('class="entry"') == 2 and "Plan smoke, 2 pairs" in page
+    assert 'placeholder = "Filter rows"' in page and "<button" not in page  # tables as those of a report
     assert "2 of 2 pairs" in page and "0 of 2 pairs" in page and found.sha256 in page
     assert "http" not in page.replace("http-equiv", "")
 

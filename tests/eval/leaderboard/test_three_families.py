@@ -5,7 +5,6 @@ The template on family `smoke` is in tests/eval/running/test_predictions.py.
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -20,20 +19,13 @@ SMALL = {"name": "smoke/one_box", "set": ["sensor.mode=512x10", "platform.scan_s
 FAMILIES = [str(HERE / "narrow.yaml"), str(HERE / "cave.yaml")]
 
 
-def script(page: str, title: str = "") -> str:
-    text = (ROOT / "eval" / page).read_text()
-    found = re.search(rf"^```python{title}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
-    assert found is not None
-    return found[1]
-
-
 def test_the_documented_scripts_get_from_a_plan_to_the_page(
     tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    Path("method.py").write_text(script("leaderboard/EVALUATE.md", r" method\.py"))
-    Path("predict.py").write_text(script("scoring/ANSWERS.md"))
+    assert command("template", "method.py", "--merge", "given")[0] == 0
+    assert command("template", "predict.py", "-q") == (0, "", "")
     for name, families in (("one", [SMALL]), ("two", FAMILIES)):
         text = f"name: {name}\nscenarios: {families}\nseeds: [10600]\nvariants: [{{preset: tunnelcd}}]\n"
         Path(f"{name}.yaml").write_text(text)

@@ -95,6 +95,7 @@ def test_the_documented_script_finds_the_box(tmp_path: Path, command: Command) -
         [sys.executable, tmp_path / "predict.py", *argv], cwd=ROOT, env={"PYTHONPATH": str(ROOT)}, check=True
     )
     code, out, _ = command("score", tmp_path / "pairs" / "one", tmp_path / "mine" / "one")
+    assert len(out.splitlines()) <= 25 and "more figures: --wide" in out
     row = dict(line.split(None, 1) for line in out.splitlines() if len(line.split()) > 1)
     assert code == 0
     assert [float(row[name]) for name in ("region_recall", "region_precision", "object_f1_50")] == [1, 1, 1]

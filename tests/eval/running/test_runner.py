@@ -687,8 +687,12 @@ def test_what_is_printed_of_a_run_that_ends_at_the_merge(
 ) -> None:
     code, out, _ = command("score", merges_copy.path)
     assert code == 0
-    assert "merge_error_m" in out
-    assert "region_recall" not in out
+    assert "merge [m]" in out and "recall" not in out
+    lines = out.splitlines()
+    assert len(lines) <= 25 and "summary.csv" in out
+    assert max(len(line) for line in lines if str(merges_copy.path) not in line) <= 80
+    code, out, _ = command("score", merges_copy.path, "--wide")
+    assert code == 0 and "merge_error_m" in out and "region_recall" not in out
 
 
 def test_an_oracle_runs_the_stages_of_its_preset(tmp_path: Path, runner: Runner) -> None:

@@ -72,7 +72,7 @@ def test_what_was_trained_is_used_at_once(
     assert code == 0 and digests["3deg"] in out
     assert command("detect", *sessions, *settings, "--out", tmp_path / "mine", "--quiet")[0] == 0
     assert json.loads((tmp_path / "mine" / "answer.json").read_text())["checkpoints"] == digests
-    _, out, _ = command("score", pair, tmp_path / "mine")
+    _, out, _ = command("score", pair, tmp_path / "mine", "--wide")
     row = dict(line.split(None, 1) for line in out.splitlines() if len(line.split(None, 1)) == 2)
     assert row["checkpoints"].strip() == ";".join(f"{name} {digest}" for name, digest in digests.items())
     # the shipped weights do not find what was described with others
