@@ -358,6 +358,12 @@ class Sensor(Lean):
         return self
 
 
+class Simulation(Settings):
+    """How a session is computed: not what is in the world, so `before` and `after` have the same."""
+
+    backend: Literal["embree", "warp"] = "embree"  # casts the sensor's rays; warp: on a GPU where there is one
+
+
 class Gait(Settings):
     """What walking adds to the movement of the sensor: amplitudes of oscillations; a stride is two steps."""
 
@@ -728,7 +734,7 @@ def _fill_in(scenario: dict[Any, Any], plan: Any) -> Any:
 class Scenario(Lean):
     """A world, what changes in it, what moves in it, and the two drives."""
 
-    _LATER: ClassVar[frozenset[str]] = frozenset({"movers", "puddles", "surface"})
+    _LATER: ClassVar[frozenset[str]] = frozenset({"movers", "puddles", "surface", "sim"})
 
     family: str
     description: str = ""
@@ -741,6 +747,7 @@ class Scenario(Lean):
     surface: tuple[SurfaceChange, ...] = ()
     sensor: Sensor = Sensor()
     platform: Platform = Platform()
+    sim: Simulation = Simulation()
     before: SessionPlan
     after: SessionPlan
 

@@ -24,7 +24,7 @@ ABSENT = "absent"
 _EXTRAS = {
     "m3c2": "py4dgeo", "dufomap": "dufomap", "octomap": "pyoctomap", "kiss": "kiss_matcher", "odometry": "kiss_icp",
     "genz": "genz_icp",
-    "ouster": "ouster", "formats": "pypcd4", "rerun": "rerun",
+    "ouster": "ouster", "formats": "pypcd4", "rerun": "rerun", "gpu": "warp",
 }  # fmt: skip
 
 

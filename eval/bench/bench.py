@@ -26,7 +26,7 @@ from eval.bench.merge import FailedContest, MergeSite, against_limit, merge_cont
 from eval.core.output import make_writable, unwritable, whole_file
 from eval.core.provenance import machine
 from sim.studies.bench import BenchSite, sensor_contests
-from sim.studies.timing import Contest, timed
+from sim.studies.timing import Contest, SkippedContest, timed
 
 Contests = Mapping[str, Callable[[], Contest]]
 Row = dict[str, Any]
@@ -88,13 +88,15 @@ def make_row(name: str, contest: Contest) -> Row:
 
     `value` and `rival_value` are medians over `n` repetitions; `spread` is the distance between the quartiles of
     `value`. `ratio` tells how many times faster than its rival it is, and `met` whether that reaches `target`; both are
-    None without a rival that can be compared. What failed has no value, `met` is False and `reason` says why; `reason`
-    is "" everywhere else.
+    None without a rival that can be compared. What failed has no value, `met` is False and `reason` says why; what this
+    machine cannot do has no value, `met` is None and `reason` says what is missing; `reason` is "" everywhere else.
     """
     row = dict.fromkeys(("name", "value", "unit", "rival", "rival_value", "ratio", "target", "met", "n", "spread"))
     row |= {"name": name, "unit": contest.unit, "target": contest.target}
     if isinstance(contest, FailedContest):
         return row | {"met": False, "n": 0, "reason": contest.reason}
+    if isinstance(contest, SkippedContest):
+        return row | {"n": 0, "reason": contest.reason}
     figures = _figures(contest, contest.seconds)
     value = float(np.median(figures))
     rival = float(np.median(_figures(contest, contest.rival_seconds))) if contest.rival_seconds else None
@@ -126,7 +128,7 @@ def summarise(rows: Sequence[Row]) -> str:
 
 
 def list_reasons(rows: Sequence[Row]) -> list[str]:
-    """Return one line for every row that failed."""
+    """Return one line for every row that failed or was skipped."""
     return [f"{row['name']}: {row['reason']}" for row in rows if row["reason"]]
 
 

@@ -31,6 +31,19 @@ def ray() -> str:
     return f"a ray meets a wall at {ranges_m[0]:.3f} m"
 
 
+def kernel() -> str:
+    """Cast a ray from the middle of a box at one of its walls (warp-lang), on a GPU where there is one."""
+    import numpy as np
+
+    from sim.geometry.mesh import box_mesh
+    from sim.geometry.warp_caster import WarpCaster
+
+    caster = WarpCaster([box_mesh([_HALF_M] * 3)], np.zeros(3))
+    ranges_m, _, _ = caster.cast_local(np.zeros((1, 3), np.float32), np.array([[1.0, 0.0, 0.0]], np.float32))
+    _require(abs(ranges_m[0] - _HALF_M) < 1e-4, f"a ray met a wall {_HALF_M} m away at {ranges_m[0]} m")
+    return f"a ray meets a wall at {ranges_m[0]:.3f} m on {caster.device}"
+
+
 def world() -> str:
     """Build the world of a shipped scenario (mujoco; trimesh, scikit-image and embreex on the way)."""
     from scenarios.library import load_scenario
@@ -246,6 +259,7 @@ OF_EXTRA: dict[str, Callable[[], str]] = {
     "octomap": free_space,
     "formats": point_file,
     "rerun": recording,
+    "gpu": kernel,
     "cluster": cluster,
 }
 

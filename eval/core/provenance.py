@@ -21,7 +21,7 @@ TOOL = "tunnelcd"
 FORMAT_VERSION = 1
 _PACKAGES = (
     "tunnelcd", "numpy", "scipy", "pandas", "torch", "mujoco", "embreex", "trimesh", "small_gicp", "kiss-matcher",
-    "py4dgeo", "dufomap", "pyoctomap", "kiss-icp", "scikit-image", "pydantic", "matplotlib", "distributed",
+    "py4dgeo", "dufomap", "pyoctomap", "kiss-icp", "warp-lang", "scikit-image", "pydantic", "matplotlib", "distributed",
 )  # fmt: skip
 # No result depends on these extras.
 _OTHER_PACKAGES = ("ouster-sdk", "viser")

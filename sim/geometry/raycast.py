@@ -14,9 +14,11 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array
+from sim.geometry.bundles import Bundle, make_bundle_rays
 from sim.geometry.mesh import Mesh, box_mesh, cylinder_mesh, move_mesh
 
 _CYLINDER_SEGMENTS = 64
+_BLOCK_COLUMNS = 128
 
 
 class RayCaster(ABC):
@@ -24,9 +26,11 @@ class RayCaster(ABC):
 
     Attributes:
         centre_m: (3,) float64 centre of the scene, world frame, whole metres; rays in float32 start from it.
+        keeps_hits: Whether hits can stay on a device, where `sim.sensor.blending` blends them.
     """
 
     centre_m: Float64Array
+    keeps_hits = False
 
     @abstractmethod
     def cast_local(
@@ -47,6 +51,21 @@ class RayCaster(ABC):
         local = np.repeat((origins - self.centre_m).astype(np.float32), height, axis=0)
         ranges_m, ids, cosines = self.cast_local(local, directions.reshape(-1, 3))
         return ranges_m.reshape(width, height), ids.reshape(width, height), cosines.reshape(width, height)
+
+    def cast_bundles(
+        self, origins: Float64Array, directions: Float32Array, bundle: Bundle
+    ) -> tuple[Float32Array, Int32Array, Float32Array]:
+        """Cast the n rays of every beam of a revolution; the results of `Caster.cast`, each (n, W * H).
+
+        Args:
+            origins: (W, 3) float64 point where all beams of a column start, world frame, metres.
+            directions: (W, H, 3) float32 unit vectors, contiguous.
+            bundle: Where the rays of a beam lie.
+        """
+        # The rays of a beam are cast one after another: they meet the same triangles, which takes a quarter less time.
+        hits = self.cast_local(*make_bundle_rays(origins, directions, bundle, self.centre_m))
+        ranges_m, ids, cosines = (each.reshape(-1, len(bundle.places)).T for each in hits)
+        return np.ascontiguousarray(ranges_m), np.ascontiguousarray(ids), np.ascontiguousarray(cosines)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,6 +148,20 @@ class Caster(RayCaster):
         cosines[is_miss] = 0.0
         ranges_m[is_miss] = np.inf
         return ranges_m, ids, cosines
+
+    def cast_bundles(
+        self, origins: Float64Array, directions: Float32Array, bundle: Bundle
+    ) -> tuple[Float32Array, Int32Array, Float32Array]:
+        """Cast the n rays of every beam of a revolution as `RayCaster.cast_bundles` does, some columns at a time."""
+        width, height, _ = directions.shape
+        shape = len(bundle.places), width * height
+        answer = np.empty(shape, np.float32), np.empty(shape, np.int32), np.empty(shape, np.float32)
+        for first in range(0, width, _BLOCK_COLUMNS):  # their arrays stay in the processor's cache
+            columns = slice(first, first + _BLOCK_COLUMNS)
+            hits = RayCaster.cast_bundles(self, origins[columns], directions[columns], bundle)
+            for whole, part in zip(answer, hits, strict=True):
+                whole[:, first * height : first * height + part.shape[1]] = part
+        return answer
 
     def hits(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[Float32Array, Int32Array, Float32Array]:
         """Return distances and mesh numbers as `cast` does, and the (N, 3) unit normals (0 for a miss)."""

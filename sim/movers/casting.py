@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array, Int64Array
-from sim.geometry.raycast import Caster, RayCaster
+from sim.geometry.raycast import RayCaster
 from sim.movers.mover import Limb, MovingBody
 from sim.scene import Scene
 
@@ -30,7 +30,7 @@ class MovingCaster(RayCaster):
     The geoms of the scene keep their numbers; those of the movers follow, mover by mover.
     """
 
-    def __init__(self, fixed: Caster, n_fixed: int, movers: Sequence[MovingBody], time_s: Float64Array) -> None:
+    def __init__(self, fixed: RayCaster, n_fixed: int, movers: Sequence[MovingBody], time_s: Float64Array) -> None:
         """Pose movers for the columns of a revolution.
 
         Args:
@@ -170,21 +170,21 @@ class MovingScene:
     """The fixed scene of a session, and what moves in it.
 
     Attributes:
+        caster: What casts the sensor's rays at the fixed scene.
         movers: The movers, in the order of the scenario.
         instance: (G,) instance of each geom, those of the movers last.
         reflectivity: (G,) share of light that each geom reflects.
     """
 
-    def __init__(self, scene: Scene, movers: Sequence[MovingBody]) -> None:
-        self.movers = tuple(movers)
+    def __init__(self, scene: Scene, movers: Sequence[MovingBody], caster: RayCaster | None = None) -> None:
+        """Let movers move in a scene; `caster` casts at it in place of the scene's own."""
+        self.movers, self.caster = tuple(movers), caster or scene.caster
         own = [np.full(len(mover.figure.materials), mover.instance, np.int32) for mover in movers]
         self.instance = np.concatenate([scene.instance, *own])
         self.reflectivity = np.concatenate([scene.reflectivity, *(mover.figure.reflectivity for mover in movers)])
-        self._scene = scene
+        self._n_fixed = len(scene.instance)
 
-    def pose(self, time_s: Float64Array) -> Scene | PosedScene:
+    def pose(self, time_s: Float64Array) -> PosedScene:
         """Return the scene as the columns of a revolution meet it at times (W,); without movers the fixed one."""
-        if not self.movers:
-            return self._scene
-        caster = MovingCaster(self._scene.caster, len(self._scene.instance), self.movers, time_s)
+        caster = MovingCaster(self.caster, self._n_fixed, self.movers, time_s) if self.movers else self.caster
         return PosedScene(caster, self.instance, self.reflectivity)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
+from sim.geometry.bundles import Bundle
 from sim.geometry.raycast import RayCaster
-from sim.sensor.optics import received_photons, reflected_share
+from sim.sensor.optics import RETRO_FROM, received_photons, reflected_share
 from sim.sensor.rays import Rays
 
 # Width of the beam at half its brightness: 9.5 mm where it leaves the window, growing by 0.18 deg (data sheet of the
@@ -107,11 +108,8 @@ def cast_beams(
 ) -> BeamHits:
     """Cast several rays over the width of every beam at geoms of these reflectivities (G,)."""
     places, weights = sub_ray_pattern(sub_rays)
-    # The rays of a beam are cast one after another: they meet the same triangles, which takes a quarter less time.
-    hits_m, hit_geoms, hit_cosines = caster.cast_local(*_beam_rays(rays, places, caster.centre_m))
-    ranges_m: Float32Array = np.ascontiguousarray(hits_m.reshape(-1, sub_rays).T) + np.float32(beam_origin_m)
-    geoms: Int32Array = np.ascontiguousarray(hit_geoms.reshape(-1, sub_rays).T)
-    cosines: Float32Array = np.ascontiguousarray(hit_cosines.reshape(-1, sub_rays).T)
+    ranges_m, geoms, cosines = caster.cast_bundles(rays.origins, rays.directions, beam_bundle(places))
+    ranges_m += np.float32(beam_origin_m)
     photons = np.empty_like(ranges_m)
     for ray, weight in enumerate(weights):
         power = reflected_share(reflectivity, geoms[ray], cosines[ray])
@@ -128,6 +126,14 @@ def spread_echo(
     sub_rays: Literal[7, 19],
 ) -> Echo:
     """Cast several rays over the width of every beam and return the echo that they blend into (`blend_beams`)."""
+    if caster.keeps_hits and not (reflectivity >= RETRO_FROM).any():
+        from sim.sensor.blending import blend_on_device  # noqa: PLC0415 - an extra
+
+        places, weights = sub_ray_pattern(sub_rays)
+        told = cast(Any, caster), reflectivity, rays, beam_origin_m, owners, beam_bundle(places), weights, PULSE_M
+        light, (geom, owner) = blend_on_device(*told)
+        range_m, photons, cosine, true_range_m, share = light
+        return Echo(range_m, photons, cosine, true_range_m, geom, owner, share)
     hits = cast_beams(caster, reflectivity, rays, beam_origin_m, sub_rays)
     return blend_beams(hits, owners, rays.directions.shape[:2])
 
@@ -199,6 +205,11 @@ def sub_ray_pattern(sub_rays: int) -> tuple[Float64Array, Float64Array]:
     places = np.concatenate([middle, hexagon, between, 2.0 * hexagon])
     weights = 0.5 ** (places**2).sum(axis=1)
     return places, weights / weights.sum()
+
+
+def beam_bundle(places: Float64Array) -> Bundle:
+    """Return the bundle of a beam's rays at places (n, 2) across it, as of `sub_ray_pattern`."""
+    return Bundle(places, WAIST_M / 2, float(np.tan(DIVERGENCE_RAD / 2)))
 
 
 def blend_echoes(ranges_m: Float32Array, photons: Float32Array) -> tuple[Float32Array, Float32Array, Int64Array]:
@@ -280,30 +291,3 @@ def _strongest_group_light(
     for place, row in zip(group, light, strict=True):
         totals[place, pixels] += row
     return np.where(group == totals.argmax(axis=0), light, np.float32(0.0)), reach_m, order
-
-
-def _beam_rays(rays: Rays, places: Float64Array, centre_m: Float64Array) -> tuple[Float32Array, Float32Array]:
-    """Return the origins from a centre, and the directions, of the rays at n places across every beam.
-
-    Both are (W * H * n, 3). They are computed by component: numpy is slow on rows of three.
-    """
-    directions = np.ascontiguousarray(rays.directions.reshape(-1, 3).T)
-    beam_origins = np.repeat(rays.origins.T, rays.directions.shape[1], axis=1)
-    right, up = _across(directions)
-    x, y = places.astype(np.float32).T[..., None]
-    slope = np.tan(DIVERGENCE_RAD / 2)
-    lengths = np.sqrt(1.0 + (places * places).sum(axis=1, keepdims=True) * slope**2).astype(np.float32)
-    origins, ways = np.empty((2, directions.shape[1], len(places), 3), np.float32)
-    for axis in range(3):
-        aside = right[axis] * x + up[axis] * y
-        origins[..., axis] = (beam_origins[axis] + aside * np.float32(WAIST_M / 2) - centre_m[axis]).T
-        ways[..., axis] = ((aside * np.float32(slope) + directions[axis]) / lengths).T
-    return origins.reshape(-1, 3), ways.reshape(-1, 3)
-
-
-def _across(directions: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """Two unit vectors (3, N) at right angles to each beam (3, N) and to one another, the first one level."""
-    x, y, z = directions
-    level = np.maximum(np.hypot(x, y), np.float32(1e-6))
-    right = np.stack([y / level, -x / level, np.zeros_like(z)])
-    return right, np.stack([right[1] * z, right[0] * -z, level])

@@ -10,6 +10,7 @@ import numpy as np
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Scenario
 from sim.drive.trajectory import Trajectory, load_sensor, plan_trajectory
+from sim.geometry.backends import make_sensor_caster
 from sim.movers.casting import MovingScene
 from sim.movers.mover import MovingBody
 from sim.movers.planning import plan_movers
@@ -106,7 +107,7 @@ def make_drive(
 ) -> Drive:
     """Return the drive of a session in its part of a pair; without tallies and rock it is a session alone."""
     scene, trajectory, own = planned.scene, planned.trajectory, planned.scenario
-    moving = MovingScene(scene, planned.movers)
+    moving = MovingScene(scene, planned.movers, make_sensor_caster(own.sim.backend, scene.meshes, scene.caster))
     labels = np.append(moving.instance, [-5, -4, -3, -2, -1]).astype(np.int16)
     held = [tally.change.instance for tally in tallies if tally.change.session == name]
     owners = np.where(np.isin(moving.instance, held), moving.instance, np.int32(0))

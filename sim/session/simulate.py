@@ -26,6 +26,7 @@ from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
 from sim.drive.odometry import register_scans, start_pose
+from sim.geometry.backends import name_backend, require_backend
 from sim.session.planning import plan_drives
 from sim.session.revolution import CHANNELS, SURFACE_CHANNELS, Drive, Revolution, simulate_revolution, tally_revolution
 from sim.session.truth import (
@@ -151,6 +152,7 @@ def _plan(scenario: Scenario, seed: int, report: Progress) -> tuple[list[Drive],
     """Return both drives and the digests of the scenario's files; refuse what cannot be simulated."""
     if "kiss-icp" in (scenario.before.odometry.source, scenario.after.odometry.source):
         require_extra("odometry", "odometry.source = kiss-icp")
+    require_backend(scenario.sim.backend)
     files = file_digests(scenario)
     report("world", 0, 1)
     drives = plan_drives(scenario, seed)
@@ -168,6 +170,8 @@ def write_session(drive: Drive, folder: Path, pool: Executor, report: Progress) 
     profile = drive.scenario.sensor.profile
     provenance = {"made_by": "tunnelcd simulate", "session": drive.session, "sensor_profile": profile}
     plan = drive.scenario.plan(drive.session)
+    if drive.scenario.sim.backend != "embree":
+        provenance["casting"] = name_backend(drive.moving.caster)
     if plan.odometry.source == "kiss-icp":
         provenance["odometry"] = f"kiss-icp {extra_version('kiss-icp')}"
     with (

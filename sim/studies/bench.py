@@ -21,8 +21,10 @@ from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios.library import load_scenario
 from scenarios.schema import Prop, PropKind, Scenario
 from sim.drive.trajectory import record
+from sim.geometry.backends import find_gpu, make_sensor_caster
 from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster, model_meshes
+from sim.movers.casting import MovingScene
 from sim.placement.placing import Standing, floor_heights
 from sim.props.props import shape_of
 from sim.props.shapes import Size
@@ -31,7 +33,7 @@ from sim.sensor.rays import Rays, revolution_rays
 from sim.session.planning import plan_drives
 from sim.session.revolution import Drive
 from sim.session.simulate import write_session
-from sim.studies.timing import Contest, raced, timed
+from sim.studies.timing import Contest, SkippedContest, raced, timed
 
 THREADS = 2
 # Props of few geoms, three each. A crate has 36, which would slow the rival down nine times more.
@@ -106,7 +108,8 @@ def sensor_contests(site: BenchSite) -> dict[str, Callable[[], Contest]]:
         "casting-bare": lambda: against_embree(site),
         "casting-two-threads": lambda: two_threads(site),
         "session": lambda: time_session(site, site.drive, 15.0),
-        "session-19-sub-rays": lambda: time_session(site, spread_drive(site), 1.0),
+        "session-19-sub-rays": lambda: time_session(site, spread_drive(site), 3.0),
+        "session-19-sub-rays-gpu": lambda: time_gpu_session(site, 10.0),
     }
 
 
@@ -207,6 +210,15 @@ def spread_drive(site: BenchSite) -> Drive:
     drive = site.drive
     trajectory = record(drive.trajectory.true, spread, site.sensor, site.seed, drive.name)
     return replace(drive, scenario=spread, trajectory=trajectory)
+
+
+def time_gpu_session(site: BenchSite, target: float) -> Contest:
+    """Time the session with 19 sub-rays whose rays a GPU casts; skipped without one."""
+    if not find_gpu():
+        return SkippedContest("revolutions/s", (), target=target, reason="no GPU, or no extra `gpu`")
+    drive = spread_drive(site)
+    caster = make_sensor_caster("warp", drive.scene.meshes, drive.scene.caster)
+    return time_session(site, replace(drive, moving=MovingScene(drive.scene, drive.moving.movers, caster)), target)
 
 
 def time_session(site: BenchSite, drive: Drive, target: float) -> Contest:

@@ -31,6 +31,17 @@ class Contest:
     target: float | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class SkippedContest(Contest):
+    """Work that this machine cannot do.
+
+    Attributes:
+        reason: What it lacks.
+    """
+
+    reason: str = ""
+
+
 def timed(action: Callable[[], Any], repeats: int, clock: Clock = time.perf_counter) -> tuple[float, ...]:
     """Time an action, after one call that does not count."""
     action()

@@ -8,11 +8,11 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from eval.bench import bench
-from eval.bench.bench import choose, list_contests, make_row, measure, summarise, write_table
+from eval.bench.bench import choose, list_contests, list_reasons, make_row, measure, summarise, write_table
 from eval.bench.merge import FailedContest
 from eval.cli.main import main
 from sim.studies.bench import BenchSite
-from sim.studies.timing import Contest
+from sim.studies.timing import Contest, SkippedContest
 
 KEYS = ["name", "value", "unit", "rival", "rival_value", "ratio", "target", "met", "n", "spread", "reason"]
 FAST = Contest("Mray/s", (0.5, 0.25, 0.4, 0.2, 1.0), 2.0, "a rival", (2.0, 1.0, 4.0), 4.5)
@@ -54,6 +54,13 @@ def test_what_has_no_rival_is_not_judged() -> None:
     row = make_row("alone", ALONE)
     assert [row[key] for key in ("value", "rival", "rival_value", "ratio", "target", "met")] == [3.0] + [None] * 5
     assert summarise([row]) == "0 of 0 targets met"
+
+
+def test_what_the_machine_cannot_do_is_not_judged_and_says_why() -> None:
+    row = make_row("gpu", SkippedContest("revolutions/s", (), target=10.0, reason="no GPU"))
+    assert (row["value"], row["met"], row["n"], row["reason"]) == (None, None, 0, "no GPU")
+    assert summarise([row]) == "0 of 0 targets met; 1 not judged: gpu"
+    assert list_reasons([row]) == ["gpu: no GPU"]
 
 
 def test_a_target_just_reached_is_met() -> None:

@@ -8,11 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array, make_pose
 from cdpipe.sensor.ouster import SensorMetadata
+from sim.geometry.bundles import make_bundle_rays
 from sim.geometry.mesh import Mesh, move_mesh
 from sim.geometry.raycast import Caster
 from sim.movers.casting import MovingCaster
 from sim.movers.mover import MovingBody
-from sim.sensor.footprint import _beam_rays, central_echo, spread_echo, sub_ray_pattern
+from sim.sensor.footprint import beam_bundle, central_echo, spread_echo, sub_ray_pattern
 from sim.sensor.rays import Rays, revolution_rays
 
 Hits = tuple[Float32Array, Int32Array, Float32Array]
@@ -49,7 +50,7 @@ def test_a_posed_cast_equals_a_static_scene_for_every_column(
     rays, time_s = columns_of(sensor, 1.0)
     fixed = Caster([floor])
     caster = MovingCaster(fixed, 1, movers, time_s)
-    local = _beam_rays(rays, places, fixed.centre_m)
+    local = make_bundle_rays(rays.origins, rays.directions, beam_bundle(places), fixed.centre_m)
     got_m, got, got_cosine = (each.reshape(sensor.width, -1) for each in caster.cast_local(*local))
     assert (got > 0).sum() > 50  # the movers are met
     per_column = len(local[0]) // sensor.width

@@ -9,8 +9,9 @@ import pytest
 from sim.geometry.raycast import Caster, model_meshes
 from sim.props.shapes import solid_mesh
 from sim.scene import compile_model
+from sim.studies import bench
 from sim.studies.bench import BenchSite, crowd, mujoco_hits, sensor_contests, spread_drive, time_session
-from sim.studies.timing import Contest
+from sim.studies.timing import Contest, SkippedContest
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +29,7 @@ def test_every_row_has_its_rival_and_its_target(site: BenchSite) -> None:
         "casting-bare": pytest.approx(1 / 1.2),
         "casting-two-threads": 1.7,
     }
-    assert {"session", "session-19-sub-rays"} == named.keys() - found.keys()
+    assert {"session", "session-19-sub-rays", "session-19-sub-rays-gpu"} == named.keys() - found.keys()
     n_mrays = site.sensor.width * site.sensor.height / 1e6
     for name, contest in found.items():
         if name == "world":
@@ -39,6 +40,13 @@ def test_every_row_has_its_rival_and_its_target(site: BenchSite) -> None:
         assert len(contest.seconds) == len(contest.rival_seconds) >= 2
         assert min(contest.seconds + contest.rival_seconds) > 0
     assert "12 props in" in str(found["casting-12-props"].rival)
+
+
+def test_without_a_gpu_its_row_is_skipped_before_a_world_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench, "find_gpu", lambda: False)
+    skipped = sensor_contests(BenchSite(scenario="no/such"))["session-19-sub-rays-gpu"]()
+    assert isinstance(skipped, SkippedContest)
+    assert (skipped.reason, skipped.seconds, skipped.target) == ("no GPU, or no extra `gpu`", (), 10.0)
 
 
 def test_the_rival_finds_what_we_find(site: BenchSite) -> None:
