@@ -17,6 +17,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArraySpec, read_npz
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
 from cdpipe.core.path_frames import FRAMES
+from cdpipe.descriptors.devices import compute, find_device
 from cdpipe.descriptors.handmade import HANDMADE, VERSION
 from cdpipe.descriptors.network import (
     PlaceNetwork,
@@ -208,7 +209,7 @@ def _describe(clouds_sensor: Iterable[Float64Array], config: DescriptorConfig) -
         return np.stack([q for q, _ in vectors]), np.stack([w for _, w in vectors])
     images = torch.from_numpy(np.stack([range_image(points) for points in clouds_sensor]))
     with torch.inference_mode():
-        q, w = _network(config)[0](images)
+        q, w = compute(_network(config)[0].to(find_device(config.device)), images)
     return q.numpy().astype(np.float32), w.numpy().astype(np.float32)
 
 

@@ -83,13 +83,14 @@ class MapConfig(_Grown):
 class DescriptorConfig(_Grown):
     """The descriptor of every keyframe, computed while mapping."""
 
-    newer: ClassVar[tuple[str, ...]] = ("weights",)
+    newer: ClassVar[tuple[str, ...]] = ("weights", "device")
 
     method: Literal["3deg", "untrained", "scan-context", "solid"] = Field(
         "3deg", description="trained weights, the same network untrained, or one made by hand"
     )
     precision: Literal["float32", "int8"] = Field("float32", description="of stored sphere descriptors")
     weights: str = Field("", description="`3deg`: file of weights that `tunnelcd train` wrote; empty: the shipped ones")
+    device: Literal["cpu", "cuda"] = Field("cpu", description="`3deg`: where the network computes; `cuda`: a GPU")
 
 
 class SphereConfig(_Grown):

@@ -20,6 +20,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import stream
 from cdpipe.core.ranking import average_precision
 from cdpipe.descriptors.change_network import ChangeNetwork
+from cdpipe.descriptors.devices import compute
 from cdpipe.descriptors.sphere_image import COLUMNS
 from cdpipe.training.sphere_training import (
     CHANGED,
@@ -60,7 +61,7 @@ class ChangeTask:
     def losses(self, step: int) -> dict[str, Tensor]:
         """Return the loss of the change head and that of the visibility head."""
         own, other, marks, is_visible = self.batch(step)
-        change, visible = self.network(own, other)
+        change, visible = compute(self.network, own, other)
         is_there = own > 0
         is_known = is_there & is_visible & (marks != UNCOUNTED)
         weight = torch.tensor(_POSITIVE_WEIGHT)
@@ -120,7 +121,7 @@ class ChangeTask:
                 for arrays in directions
                 for batch in zip(*(torch.split(each, 8 * BATCH) for each in arrays), strict=True)
             ):
-                change, visible = self.network(own, other)
+                change, visible = compute(self.network, own, other)
                 is_there = own > 0
                 of_batch = change.sigmoid(), visible.sigmoid(), marks, visible_mask(own, other, marks)
                 parts.append([each[is_there] for each in of_batch])

@@ -108,7 +108,7 @@ def fit(
     """Train a task's network; afterwards it has the averaged weights of the best validation.
 
     Args:
-        task: Network, losses, scores.
+        task: Network, losses, scores; the network computes where its weights lie.
         config: Steps, rates, patience.
         folder: Holds the state after every validation; training resumes from a state found there.
         identity: Digest of data and settings; a state with another identity is refused.
@@ -215,7 +215,9 @@ def _restore(
             index, _, name = key.partition(".")
             states.setdefault(int(index), {})[name] = tensor
         optimiser.load_state_dict({**optimiser.state_dict(), "state": states})
-        return history, _below("average.", tensors), _below("best.", tensors)
+        device = next(network.parameters()).device
+        average, best = (_below(part, tensors, device) for part in ("average.", "best."))
+        return history, average, best
     except (AttributeError, KeyError, ValueError, TypeError, RuntimeError) as error:
         told = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: damaged ({told}): {_REMEDY}") from error
@@ -236,5 +238,5 @@ def _copy(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: tensor.clone() for name, tensor in tensors.items()}
 
 
-def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+def _below(prefix: str, tensors: Mapping[str, Tensor], device: torch.device | None = None) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): each.to(device) for name, each in tensors.items() if name.startswith(prefix)}

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, require_shapes, stream
+from cdpipe.descriptors.devices import compute
 from cdpipe.descriptors.network import DIMENSIONS, PlaceNetwork, yaw_correlation
 from cdpipe.descriptors.range_image import COLUMNS
 
@@ -86,7 +87,7 @@ class PlaceTask:
         # a mirrored tunnel counts as another tunnel, so all its keyframes are mirrored together
         tunnels, index = np.unique(self._data.tunnels[chosen], return_inverse=True)
         images, headings = _mirror(images, headings, (draw.random(len(tunnels)) < 0.5)[index])
-        q, w = self.network(images)
+        q, w = compute(self.network, images)
         positions, tunnel_of = self._data.positions, self._data.tunnels
         apart_m = np.linalg.norm(positions[anchors, None] - positions[None, chosen], axis=2)
         is_other = (tunnel_of[anchors, None] != tunnel_of[None, chosen]) | (apart_m > OTHER_PLACE_M)
@@ -120,7 +121,7 @@ def evaluate(network: PlaceNetwork, data: PlaceData) -> dict[str, float]:
     draw = stream(0, "evaluate-descriptor")
     images, headings = _turn(data, np.arange(len(data.positions)), draw)
     with torch.inference_mode():
-        parts = [network(batch) for batch in torch.split(images, 64)]
+        parts = [compute(network, batch) for batch in torch.split(images, 64)]
     q = torch.cat([part[0] for part in parts]).numpy()
     w = torch.cat([part[1] for part in parts])
     hits: list[bool] = []

@@ -21,6 +21,7 @@ from torch.nn import functional
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from cdpipe.core.ranking import auroc
+from cdpipe.descriptors.devices import compute
 from cdpipe.descriptors.sphere import average_neighbours, max_within_reach
 from cdpipe.descriptors.sphere_image import COLUMNS, REACH_M, ROWS
 from cdpipe.descriptors.sphere_network import SECTORS, SphereNetwork
@@ -145,7 +146,7 @@ class SphereTask:
     def losses(self, step: int) -> dict[str, Tensor]:
         """Return the classification loss of the sectors and that of the keyframes."""
         before, after, targets = self.batch(step)
-        logits = self.network(before, after)
+        logits = compute(self.network, before, after)
         is_known = targets >= 0
         weight = torch.tensor(_POSITIVE_WEIGHT)
         each = functional.binary_cross_entropy_with_logits(
@@ -241,8 +242,9 @@ def local_scores(
     logits = []
     with torch.inference_mode():
         for before, after in zip(torch.split(data.before_m, 256), torch.split(data.after_m[:, draw], 256), strict=True):
-            spheres = network.encode(before)
-            logits.append(network.compare(stored(spheres) if stored else spheres, after))
+            spheres = compute(network, before, by=network.encode)
+            spheres = stored(spheres) if stored else spheres
+            logits.append(compute(network, spheres, after, by=network.compare))
     sectors = torch.cat(logits).numpy().astype(np.float64)
     local = np.empty(len(sectors))
     for tunnel in np.unique(data.tunnels):

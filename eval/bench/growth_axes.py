@@ -95,7 +95,7 @@ def measure_size(document: Mapping[str, Any]) -> dict[str, Any]:
     reached = axis.measure(float(document["size"]), meter)
     meter.start("")
     stages = {name: asdict(cost) for name, cost in meter.costs.items() if name in axis.stages}
-    return {"size": reached, "base_mb": base_mb, "peak_mb": _most_mb(meter), "stages": stages}
+    return {"size": reached, "base_mb": base_mb, "peak_mb": max(base_mb, _most_mb(meter)), "stages": stages}
 
 
 def _most_mb(meter: StageMeter) -> float:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -143,6 +143,7 @@ def train(
     seed: Annotated[int, typer.Option(min=0, help="seed of the initial weights and of every draw")] = 0,
     threads: Annotated[int, typer.Option(min=1, help="number of torch's threads; another gives other weights")] = 2,
     patience: Annotated[int, typer.Option(min=1, help="stop after this many validations without a better score")] = 6,
+    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="where the network computes; cuda: a GPU")] = "cpu",
     quiet: Quiet = False,
 ) -> None:
     """Train a descriptor: checkpoint (safetensors), model card, curves. The same command resumes an interrupted run."""
@@ -155,6 +156,6 @@ def train(
     command = shlex.join(["tunnelcd", *sys.argv[1:]])
     with shown_progress(quiet) as progress:
         config = FitConfig(seed, steps, patience=patience)
-        checkpoint, card = train_descriptor(data, out, descriptor, config, threads, command, progress)
+        checkpoint, card = train_descriptor(data, out, descriptor, config, threads, command, progress, device)
     scores = ", ".join(f"{name} {value}" for name, value in card["validation"]["trained"].items())
     say(quiet, f"{checkpoint}: best of step {card['best_step']} on validation tunnels: {scores}")

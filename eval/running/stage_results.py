@@ -45,6 +45,7 @@ def name_result(stage: Stage, config: PipelineConfig) -> str:
                 "weights": checkpoint_digest(config.descriptor),
                 **({"airborne": "drop"} if config.map.airborne == "drop" else {}),
                 **({"every": config.described_every} if config.described_every > 1 else {}),
+                **({"device": config.descriptor.device} if config.descriptor.device != "cpu" else {}),
             }
         case "spheres":
             precision, weights = config.descriptor.precision, sphere_digest(config.sphere)

@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import torch
 
 from cdpipe.descriptors import use_threads
 from cdpipe.descriptors.change_network import make_untrained_change_network
+from cdpipe.descriptors.devices import find_device
 from cdpipe.descriptors.network import make_untrained_network
 from cdpipe.descriptors.sphere_network import SphereNetwork, make_untrained_sphere_network
 from cdpipe.descriptors.weights_file import digest, numbered_checkpoint_bytes
@@ -36,7 +38,14 @@ SOURCES = {
 
 
 def train_descriptor(
-    data: Path, out: Path, name: str, config: FitConfig, threads: int, command: str, progress: RunProgress
+    data: Path,
+    out: Path,
+    name: str,
+    config: FitConfig,
+    threads: int,
+    command: str,
+    progress: RunProgress,
+    device: str = "cpu",
 ) -> tuple[Path, dict[str, Any]]:
     """Train one descriptor on the tunnels of split train; those of split validation decide when to stop.
 
@@ -48,17 +57,20 @@ def train_descriptor(
         threads: Of torch.
         command: What to write into the card.
         progress: Told of every step.
+        device: `cpu` or `cuda`, where the network computes.
 
     Returns:
         The checkpoint and the content of its model card.
 
     Raises:
-        InputError: The folder lacks a split, is damaged, or `out` holds another run.
+        InputError: The folder lacks a split, is damaged, `out` holds another run, or no GPU can be used.
     """
     use_threads(threads)
+    place = find_device(device)
     tunnels = open_dataset(data, "train"), open_dataset(data, "validation")
     digests = tuple(data_digest(part) for part in tunnels)
     task = _make_task(name, *tunnels, config.seed)
+    task.network.to(place)
     make_writable(out)
     before = task.scores()
     latest: list[Progress] = []
@@ -75,10 +87,12 @@ def train_descriptor(
         with whole_file(out / "curves.csv") as partial:
             pd.DataFrame(rows).to_csv(partial, index=False, lineterminator="\r\n")
 
-    # another number of threads adds in another order, and gives other weights
-    identity = " ".join([name, *digests, f"{threads} threads"])
+    # another number of threads or another device adds in another order, and gives other weights
+    computed_by = [f"{threads} threads", *([device] if device != "cpu" else [])]
+    identity = " ".join([name, *digests, *computed_by])
     history = fit(task, config, out, identity, on_step, on_validation)
     draw_curves(out / "curves.png", name, history)
+    task.network.to("cpu")
     finished = task.finish()
     content = numbered_checkpoint_bytes(task.network)
     best = next(done for done in reversed(history) if done.is_best)
@@ -99,7 +113,7 @@ def train_descriptor(
         "losses": _rounded(history[-1].losses),
         "command": command,
         "commit": git_commit(),
-        "device": f"{platform.machine()} CPU, {threads} threads",
+        "device": _describe_device(place, threads),
         "seconds": round(history[-1].seconds, 1),
     }
     checkpoint = out / f"{name}.safetensors"
@@ -155,6 +169,11 @@ def _described(tunnels: Sequence[TunnelShard], data_digest: str) -> dict[str, An
         "n_keyframes": sum(tunnel.n_before for tunnel in tunnels),
         "digest": data_digest,
     }
+
+
+def _describe_device(device: torch.device, threads: int) -> str:
+    processor = f"{platform.machine()} CPU, {threads} threads"
+    return processor if device.type == "cpu" else f"{torch.cuda.get_device_name(device)}; {processor}"
 
 
 def _rounded(scores: Mapping[str, float]) -> dict[str, float]:

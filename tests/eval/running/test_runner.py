@@ -335,8 +335,11 @@ def test_stages_are_shared_by_the_settings_they_depend_on(tmp_path: Path, runner
     coarse = 'set: ["map.voxel_m=0.3"]'
     # the two that share a map stand apart in the plan
     # both presets map and merge alike
-    alike = 'set: ["map.consistency=graph", "map.airborne=drop", "map.movers=drop", "merge.refine=checked"]'
-    variants = f"{{preset: voxel-diff}}, {{preset: voxel-diff, {coarse}}}, {{preset: random-regions, {alike}}}"
+    alike = [
+        "map.consistency=graph", "map.airborne=drop", "map.movers=drop", "merge.refine=checked", "merge.first_every=4",
+    ]  # fmt: skip
+    same = f"{{preset: random-regions, set: {json.dumps(alike)}}}"
+    variants = f"{{preset: voxel-diff}}, {{preset: voxel-diff, {coarse}}}, {same}"
     run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, variants=variants), progress=told)
     # the page's maps, of the recorded poses as answers are; and those of each map setting
     assert (told.stages.count("map before"), told.stages.count("map after")) == (3, 3)
@@ -347,7 +350,7 @@ def test_stages_are_shared_by_the_settings_they_depend_on(tmp_path: Path, runner
     assert table(run)["variant"].tolist() == [
         "voxel-diff",
         "voxel-diff[map.voxel_m=0.3]",
-        "random-regions[map.consistency=graph,map.airborne=drop,map.movers=drop,merge.refine=checked]",
+        f"random-regions[{','.join(alike)}]",
     ]
 
 
