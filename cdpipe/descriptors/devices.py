@@ -12,13 +12,15 @@ from cdpipe.core.errors import InputError
 
 
 def find_device(name: str) -> torch.device:
-    """Return the device `cpu` or `cuda`, the first GPU.
+    """Return the device `cpu` or `cuda`, the first GPU, which then convolves in float32 and not in TF32.
 
     Raises:
         InputError: torch finds no GPU.
     """
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError(f"device cuda: torch {torch.__version__} finds no GPU that it can use: take device cpu")
+    if name == "cuda":
+        torch.backends.cudnn.allow_tf32 = False
     return torch.device(name)
 
 

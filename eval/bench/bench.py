@@ -23,6 +23,7 @@ from cdpipe.model.config import load_config
 from cdpipe.query.query import find_regions
 from eval.bench.extract import ExtractSite, extract_contests, extract_sites
 from eval.bench.merge import FailedContest, MergeSite, against_limit, merge_contests, paper_sites
+from eval.bench.whole import WholeSite, whole_contests
 from eval.core.output import make_writable, unwritable, whole_file
 from eval.core.provenance import machine
 from sim.studies.bench import BenchSite, sensor_contests
@@ -41,6 +42,7 @@ def list_contests(
     site: BenchSite | None = None,
     merge_sites: Sequence[MergeSite] | None = None,
     spheres: Sequence[ExtractSite] | None = None,
+    whole: WholeSite | None = None,
 ) -> dict[str, Callable[[], Contest]]:
     """Return every row's measurement by name, in the order of the table."""
     sites = merge_sites or paper_sites()
@@ -49,6 +51,7 @@ def list_contests(
         **{name: contest for each in sites for name, contest in merge_contests(each)},
         **{name: contest for each in sites for name, contest in descriptor_contests(each)},
         **{name: contest for each in spheres or extract_sites() for name, contest in extract_contests(each)},
+        **whole_contests(whole),
     }
 
 

@@ -54,6 +54,7 @@ class ExtractSite:
         voxel_s: Limit of the paper's rule.
         surface_s: Limit of the default rule's comparison.
         paper: The paper's own time, in words.
+        all_in_s: Limit of all steps of the default rule together.
         seed: Seed of the world, from the training split.
         repeats: Number of repetitions of each timing.
     """
@@ -63,6 +64,7 @@ class ExtractSite:
     voxel_s: float
     surface_s: float
     paper: str
+    all_in_s: float | None = None
     seed: int = 0
     repeats: int = 31
 
@@ -182,7 +184,7 @@ def extract_sites() -> tuple[ExtractSite, ExtractSite]:
     """Return the sites of the table: spheres as large as those of the paper's two."""
     return (
         ExtractSite(2500, "train/narrow", 0.0005, 0.0015, "0.5 ms"),
-        ExtractSite(15000, "train/wide", 0.0025, 0.006, "5.7 to 11 ms"),
+        ExtractSite(15000, "train/wide", 0.0025, 0.006, "5.7 to 11 ms", 0.025),
     )
 
 
@@ -201,12 +203,19 @@ def extract_contests(site: ExtractSite) -> Iterator[tuple[str, Callable[[], Cont
     }
     for name, (step, limit_s) in steps.items():
         yield f"extract-surface-{size}{name}", partial(_step, site, step, limit_s)
+    every = [step for step, _ in steps.values()]
+    yield f"extract-surface-{size}-all-in", partial(_step, site, partial(_take_all, every), site.all_in_s)
 
 
 def _compute_again(name: str) -> Callable[[Region], object]:
     """Return the step behind a cached property."""
     step: Callable[[Region], object] = vars(Region)[name].func
     return step
+
+
+def _take_all(steps: Sequence[Callable[[Region], object]], region: Region) -> None:
+    for step in steps:
+        step(region)
 
 
 def _step(site: ExtractSite, step: Callable[[Region], object], limit_s: float | None) -> Contest:

@@ -44,7 +44,7 @@ def test_rows_of_both_paper_sites_stand_in_the_table() -> None:
             name.replace("tiny", size) for name in ROWS
         ]
     goals = [each.goals for each in paper_sites()]
-    assert goals == [Goals(0.051, 0.1, 10.0, 3.0), Goals(0.1, 2.5, 10.0, 5.0)]
+    assert goals == [Goals(0.051, 0.1, 10.0, 3.0), Goals(0.1, 0.3, 10.0, 5.0, 0.7)]
 
 
 @needs_kiss_matcher
