@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from cdpipe.core.errors import InputError
+from cdpipe.core.errors import InputError, TunnelcdError
 from cdpipe.core.yamlfile import suggest
 from cdpipe.descriptors.sphere import anchor_frames, change_log_odds, describe_map
 from cdpipe.merge.merge import merge_maps
@@ -82,8 +82,16 @@ def measure(every: Contests, on_progress: Callable[[str, int, int], None] | None
     for done, (name, contest) in enumerate(every.items()):
         if on_progress is not None:
             on_progress(name, done, len(every))
-        rows.append(make_row(name, contest()))
+        rows.append(make_row(name, _attempt(contest)))
     return {"machine": machine(), "rows": rows}
+
+
+def _attempt(contest: Callable[[], Contest]) -> Contest:
+    """Measure a row; one that cannot be measured costs no other."""
+    try:
+        return contest()
+    except TunnelcdError as error:
+        return FailedContest("", (), reason=str(error))
 
 
 def make_row(name: str, contest: Contest) -> Row:

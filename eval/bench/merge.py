@@ -53,7 +53,7 @@ _ALL_IN = "ours: descriptors + index + merge to a rigid transform, as the rival 
 
 @dataclass(frozen=True, slots=True)
 class FailedContest(Contest):
-    """A row that could not be timed because our merge failed, with the reason."""
+    """A row that could not be timed, for example because our merge failed, with the reason."""
 
     reason: str = ""
 

@@ -43,7 +43,7 @@ class WholeSite:
 
     wide: str = "wide"
     world_s: float = 1.2
-    training: str = "train/tight"
+    training: str = "train/narrow"
     pairs_per_s: float = 25.0
     recorded: str = "paper/site1"
     speed: float = 50.0

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 
+from cdpipe.core.errors import InputError
 from eval.bench.bench import list_contests, measure
 from eval.bench.whole import WholeSite, whole_contests
+from sim.studies.timing import Contest
 
 
 def test_rows_of_a_small_world() -> None:
@@ -19,6 +21,17 @@ def test_rows_of_a_small_world() -> None:
     # seconds of recording per second of work, against one second of recording a second
     assert rows["detect-60k"]["rival_value"] == 1.0
     json.dumps(rows)
+
+
+def test_a_row_that_cannot_be_measured_costs_no_other() -> None:
+    def refuse() -> Contest:
+        raise InputError("no place for a prop")
+
+    rows = measure({"refused": refuse, "timed": lambda: Contest("s", (1.0,))})["rows"]
+    assert [(row["value"], row["met"], row["reason"]) for row in rows] == [
+        (None, False, "no place for a prop"),
+        (1.0, None, ""),
+    ]
 
 
 def test_they_stand_in_the_table() -> None:
