@@ -177,7 +177,7 @@ def checkpoint_digest(config: DescriptorConfig) -> str:
     """Return the digest of the weights of the descriptor in `config`; of a hand-made one its version.
 
     Raises:
-        InputError: The file of weights cannot be used.
+        InputError: The file of weights, or the device, cannot be used.
     """
     return f"version {VERSION}" if config.method in HANDMADE else _network(config)[1]
 
@@ -209,14 +209,15 @@ def _describe(clouds_sensor: Iterable[Float64Array], config: DescriptorConfig) -
         return np.stack([q for q, _ in vectors]), np.stack([w for _, w in vectors])
     images = torch.from_numpy(np.stack([range_image(points) for points in clouds_sensor]))
     with torch.inference_mode():
-        q, w = compute(_network(config)[0].to(find_device(config.device)), images)
+        q, w = compute(_network(config)[0], images)
     return q.numpy().astype(np.float32), w.numpy().astype(np.float32)
 
 
 def _network(config: DescriptorConfig) -> tuple[PlaceNetwork, str]:
-    if config.method == "3deg" and config.weights:
-        return _parse(read_weights(config.weights), config.weights)
-    return _shipped(config.method)
+    """Return the network on its device, and the digest of its weights."""
+    has_own = config.method == "3deg" and config.weights
+    network, of_weights = _parse(read_weights(config.weights), config.weights) if has_own else _shipped(config.method)
+    return network.to(find_device(config.device)), of_weights
 
 
 @cache
