@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -93,12 +94,12 @@ def make_consistent(
     scans, told = Samples(source), _Told(on_step, len(poses))
     if not _agree(scans, poses, told):
         poses = _follow(scans, _FOLLOWING, told)
-        poses, off_share = _sweep(scans, poses, _BY_HALVES, told, by_halves=True)
+        poses, off_share = _sweep_all(scans, poses, _BY_HALVES, told, by_halves=True)
         is_bent = _find_bent(scans.path_m, off_share)
-        poses, _ = _sweep(scans, poses, _WITH_ALL, told)
+        poses, _ = _sweep_all(scans, poses, _WITH_ALL, told)
     loops = find_loops(scans, poses) if has_loops else ()
     if loops:
-        poses, _ = _sweep(scans, close_loops(scans.path_m, poses, loops), _WITH_ALL, told, loops=loops)
+        poses, _ = _sweep_all(scans, close_loops(scans.path_m, poses, loops), _WITH_ALL, told, loops=loops)
     return ConsistentScans(source, poses, is_bent)
 
 
@@ -107,8 +108,7 @@ def _agree(scans: Samples, poses: Float64Array, told: _Told) -> bool:
     n, moved_m = len(poses), np.zeros(len(poses))
     below = int(0.9 * (n - 1))  # the 90th percentile lies between this one of the sorted values and the next
     n_near = n_far = 0
-    told.begin()
-    for own, found, _ in _sweep_blocks(scans, poses, _WITH_ALL, told):
+    for own, found, _ in _sweep(scans, poses, _WITH_ALL, told):
         moved_m[own] = np.linalg.norm((found - poses[own])[:, :3, 3], axis=1)
         n_near += int(np.count_nonzero(moved_m[own] < _AGREE_M * (1 - _ROUNDING)))
         n_far += int(np.count_nonzero(moved_m[own] > _AGREE_M * (1 + _ROUNDING)))
@@ -159,6 +159,16 @@ def _follow(scans: Samples, settings: Registration, told: _Told) -> Float64Array
     return found
 
 
+def _sweep_all(
+    scans: Samples, poses: Float64Array, settings: Registration, told: _Told, **choices: Any
+) -> tuple[Float64Array, Float64Array]:
+    """Return all (S, 4, 4) poses after one `_sweep`, and the (S,) shares; choices are keyword arguments of `_sweep`."""
+    found, off_share = poses.copy(), np.zeros(len(poses))
+    for own, found_of_block, off_share_of_block in _sweep(scans, poses, settings, told, **choices):
+        found[own], off_share[own] = found_of_block, off_share_of_block
+    return found, off_share
+
+
 def _sweep(
     scans: Samples,
     poses: Float64Array,
@@ -167,10 +177,8 @@ def _sweep(
     *,
     by_halves: bool = False,
     loops: tuple[Loop, ...] = (),
-) -> tuple[Float64Array, Float64Array]:
-    """Return the (S, 4, 4) poses after one sweep, and the (S,) share of each scan's points that are off the walls.
-
-    All scans of a block are registered with the poses before it.
+) -> Iterator[tuple[Int64Array, Float64Array, Float64Array]]:
+    """Register all scans of a block with the poses before it, block by block.
 
     Args:
         scans: The scans.
@@ -179,26 +187,11 @@ def _sweep(
         told: Told of every scan.
         by_halves: Whether a scan is compared with every second scan alone.
         loops: Closed loops: scans of both passes are registered with one another.
+
+    Yields:
+        (B,) scans of a block, their (B, 4, 4) poses, and the (B,) share of each scan's points that are off the walls.
     """
-    found, off_share = poses.copy(), np.zeros(len(poses))
     told.begin()
-    for own, found_of_block, off_share_of_block in _sweep_blocks(
-        scans, poses, settings, told, by_halves=by_halves, loops=loops
-    ):
-        found[own], off_share[own] = found_of_block, off_share_of_block
-    return found, off_share
-
-
-def _sweep_blocks(
-    scans: Samples,
-    poses: Float64Array,
-    settings: Registration,
-    told: _Told,
-    *,
-    by_halves: bool = False,
-    loops: tuple[Loop, ...] = (),
-) -> Iterator[tuple[Int64Array, Float64Array, Float64Array]]:
-    """Yield (B,) scans of each block, their (B, 4, 4) poses and (B,) shares; arguments as of `_sweep`."""
     steps = invert(scans.recorded[:-1]) @ scans.recorded[1:]
     blocks = np.floor(scans.path_m / _BLOCK_M)
     for block in np.unique(blocks):

@@ -76,7 +76,7 @@ def test_the_first_sweep_ends_once_it_is_certain_and_decides_as_a_whole_one(
                     given.append(len(own))
                     yield own, moved[own], np.zeros(len(own))
 
-            monkeypatch.setattr(consistency, "_sweep_blocks", blocks)
+            monkeypatch.setattr(consistency, "_sweep", blocks)
             told = consistency._Told(lambda step, done, total: None, n)
             decided = consistency._agree(None, np.repeat(np.eye(4)[None], n, axis=0), told)  # type: ignore[arg-type]
             assert decided == (np.percentile(moved_m, 90) <= 0.015)
