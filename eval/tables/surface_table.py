@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from cdpipe.core.geometry import BoolArray
 from eval.core.statistics import median
 from eval.plans.targets import Targets
+from eval.scoring.surface_metrics import SURFACE_GROUP
 from eval.scoring.surface_windows import AREAS_M2
 from eval.tables.conditions import by_condition
-from eval.tables.rows import by_domain, by_variant, means_with_intervals, numbers, of_cases, with_domain
+from eval.tables.rows import by_domain, by_variant, means_with_intervals, numbers, of_cases, texts, with_domain
 from eval.tables.surface_limits import detection_limits
 from eval.tables.targets import judged_targets
 
@@ -35,7 +37,8 @@ def surface_tables(
     """Return the tables of a run about rock that moved, by file name; empty ones where no pair asks for it.
 
     Args:
-        results: Rows as in results.csv.
+        results: Rows as in results.csv. Where a pair asks for a displacement field, those that ask for none are left
+            out: an answer might give a field at the easy ones alone.
         windows: Rows as in surface_windows.csv.
         targets: What the plan of the run asks for.
         is_whole: Whether all that was planned is in the tables; otherwise no target is said to be met or missed.
@@ -47,7 +50,7 @@ def surface_tables(
     """
     rows: list[dict[str, Any]] = []
     limits: list[dict[str, Any]] = []
-    is_asked = ~np.isnan(numbers(results, "surface_cover"))
+    is_asked = _mark_asked(results)
     windows_by_variant = by_variant(windows)
     for condition, is_its in by_condition(results, targets):
         own_results = results[is_its & is_asked]
@@ -74,6 +77,14 @@ def surface_tables(
     table = pd.DataFrame(rows)
     judged = judged_targets(targets, "surface", table, results, is_whole=is_whole) if rows else pd.DataFrame()
     return {"surface_table": table, "surface_targets": judged, "detection_limits": pd.DataFrame(limits)}
+
+
+def _mark_asked(results: pd.DataFrame) -> BoolArray:
+    """Mark the rows with scores of a field on pairs that ask for one; where no pair asks, all rows with such scores."""
+    is_scored = ~np.isnan(numbers(results, "surface_cover"))
+    is_surface = np.array([name.partition("/")[0] == SURFACE_GROUP for name in texts(results, "family")], np.bool_)
+    is_asked = is_scored & (is_surface | (numbers(results, "n_surface_changes") > 0))
+    return is_asked if is_asked.any() else is_scored
 
 
 def limit_column(area_m2: float) -> str:

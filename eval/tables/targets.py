@@ -25,6 +25,10 @@ _COUNTS = {
     "false_regions_per_100m_unchanged": "n_unchanged", "displacement_error_m": "n_displacements",
     "pile_volume_error": "n_piles", "object_iou_point_partial": "n_partial",
 }  # fmt: skip
+# what an answer gains by leaving rock out: nothing is met where fewer of the judged places than these are measured
+_MEASURED = ("surface_error_", "surface_level_")
+_LEAST_COVER = 0.5
+_LIMIT = "surface_limit_"
 _ENDS = {"silent_share": ("silent_low", "silent_high")}
 
 
@@ -38,6 +42,9 @@ def judged_targets(
     is_whole: bool = True,
 ) -> pd.DataFrame:
     """Return what is asked and whether it is met; no row for a figure that is undefined.
+
+    A detection limit is undefined where half of the largest changes are not found: the target is missed. An error or a
+    level of the rock is no merit of an answer that measures less than half of it.
 
     Args:
         targets: What the plan asks for.
@@ -67,9 +74,11 @@ def judged_targets(
             found = _against(target, variant, ranked or {})
         else:
             found = _of_table(target, variant, table)
-        if found is not None and not math.isnan(found["value"]):
-            is_long = found.pop("km", math.inf) >= target.least_km
-            verdict = target.is_met_by(found["value"]) if is_whole and is_long else None
+        if found is None:
+            continue
+        is_long, is_missed = found.pop("km", math.inf) >= target.least_km, found.pop("is_missed", False)
+        if is_missed or not math.isnan(found["value"]):
+            verdict = target.is_met_by(found["value"]) and not is_missed if is_whole and is_long else None
             rows.append({"target": target.name, "variant": variant, "asked": target.asked, **found, "is_met": verdict})
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype({"is_met": object})
 
@@ -85,8 +94,15 @@ def _of_table(target: Target, variant: str, table: pd.DataFrame) -> dict[str, An
     return {
         "domain": str(row["domain"]), "value": float(row[target.column]), "low": float(row.get(low, math.nan)),
         "high": float(row.get(high, math.nan)), "n": int(row[_COUNTS.get(target.column, "n_pairs")]),
-        "km": float(row.get("km_unchanged", math.inf)),
+        "km": float(row.get("km_unchanged", math.inf)), "is_missed": _is_missed(target.column, row),
     }  # fmt: skip
+
+
+def _is_missed(column: str, row: Mapping[str, Any]) -> bool:
+    """Tell whether a figure of surface_table.csv meets no bound, whatever its value."""
+    if column.startswith(_LIMIT) and math.isnan(row[column]):
+        return bool(row["n_surface_changes"] > 0)
+    return bool(column.startswith(_MEASURED) and row.get("surface_cover", math.nan) < _LEAST_COVER)
 
 
 def _against(

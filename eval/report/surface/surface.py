@@ -42,7 +42,8 @@ SURFACE_COLUMNS = (
     Column("surface_level_inside", "inside its level", None, share,
            "Share of the unchanged places measured whose displacement is within the claimed 95 % level of detection; "
            "0.95 is right. A place without a level is not inside."),
-    Column("surface_level_median_m", "level, median [mm]", "low", _mm, "", "Undefined where no level is claimed."),
+    Column("surface_level_median_m", "level, median [mm]", None, _mm,
+           "A level that is too low costs the share inside instead.", "Undefined where no level is claimed."),
     Column("surface_recall", "recall", "high", share,
            "Share of the observable surface changes of which answered regions hold at least half of the places that "
            "moved most, with the right sign.", "Undefined where no rock moved."),
