@@ -49,8 +49,10 @@ def budget_rows(ranked: RankedPairs, results: pd.DataFrame, regions: pd.DataFram
     Returns:
         `price`, `budget`, `recall` with its 95 % interval over pairs, and `area`, the mean recall from no budget to 12
         spheres or 10 s per 100 m, or 10 % of the map's bytes, with its interval. They are NaN where an answer does not
-        state what the price needs.
+        state what the price needs. In rows of bytes, `asked_share` is the mean share of the map that a look asks for:
+        small spheres make it small.
     """
+    asked_share = _share_of_a_look(results, regions)
     prices = price_changes(ranked, results, regions)
     rows = []
     for price, budgets in BUDGETS.items():
@@ -60,7 +62,8 @@ def budget_rows(ranked: RankedPairs, results: pd.DataFrame, regions: pd.DataFram
             found = np.where(np.isnan(costs), np.nan, costs <= budget)
             recall = _mean_over_changes(found, ranked)
             names = {"price": price, "budget": budget, "n_changes": len(costs)}
-            rows.append({**names, **_named("recall", recall), **_named("area", area)})
+            share = asked_share if price == "bytes" else math.nan
+            rows.append({**names, **_named("recall", recall), **_named("area", area), "asked_share": share})
     return rows if len(ranked.change_pair) else []
 
 
@@ -97,6 +100,15 @@ def _asked_bytes(regions: pd.DataFrame) -> dict[tuple[str, int], Float64Array]:
     return {
         (str(name), int(seed)): BYTES_PER_POINT * np.cumsum(own) for (name, seed), own in zip(names, parts, strict=True)
     }
+
+
+def _share_of_a_look(results: pd.DataFrame, regions: pd.DataFrame) -> float:
+    """Return the mean of what each candidate asks for as a share of its map; NaN where one does not state it."""
+    if not len(regions):
+        return math.nan
+    whole = dict(zip(results.set_index(PAIR).index, numbers(results, "bytes_map_before"), strict=True))
+    own = np.array([whole.get(pair, math.nan) for pair in zip(regions["scenario"], regions["seed"], strict=True)])
+    return float(np.mean(BYTES_PER_POINT * numbers(regions, ASKED_POINTS) / own))
 
 
 def _seconds_per_look(results: pd.DataFrame) -> Float64Array:

@@ -74,3 +74,17 @@ def test_a_pair_that_proposed_no_region_takes_the_seconds_of_the_others() -> Non
 
 def test_no_change_has_no_budget() -> None:
     assert budget_rows(*tables([{"seed": 1, "n_observable": 0}], [(1, 9.0, "", 10)], [])) == []
+
+
+def test_small_spheres_cost_few_bytes_and_the_share_that_a_look_asks_for_shows_them() -> None:
+    for n_points, share in ((100, 0.1), (1, 0.001)):
+        looks = [(1, 9.0, "1", n_points), (1, 8.0, "", n_points)]
+        rows = budget_rows(*tables([{"seed": 1, "bytes_regions_before": 0.0}], looks, [(1, 1)]))
+        of_bytes = {row["budget"]: row for row in rows if row["price"] == "bytes"}
+        assert of_bytes[0.01]["recall"] == float(share <= 0.01)
+        assert [row["asked_share"] for row in of_bytes.values()] == pytest.approx([share] * len(of_bytes))
+        assert np.isnan([row["asked_share"] for row in rows if row["price"] != "bytes"]).all()
+    unstated = budget_rows(*tables([{"seed": 1}], [(1, 9.0, "1", 5), (1, 8.0, "", NAN)], [(1, 1)]))
+    assert np.isnan([row["asked_share"] for row in unstated]).all()
+    silent = budget_rows(*tables([{"seed": 1}], [], [(1, 1)]))
+    assert np.isnan([row["asked_share"] for row in silent]).all()

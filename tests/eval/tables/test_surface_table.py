@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from eval.plans.targets import Targets
-from eval.tables.surface_limits import EDGES_M, detection_limits, interpolate_limit
+from eval.tables.surface_limits import EDGES_M, detection_limits, find_threshold, interpolate_limit
 from eval.tables.surface_table import FILES, surface_tables
 
 NAN = float("nan")
@@ -61,6 +61,31 @@ def test_null_windows_that_are_not_covered_lower_no_threshold() -> None:
     (row,) = detection_limits(pd.DataFrame([*left_out, window(0.02, 0.5)]))
     assert np.isnan(row["threshold_m"])
     assert row["found_share"] == 0.0
+
+
+def test_the_threshold_rises_where_more_than_15_percent_of_all_null_windows_are_beyond_it() -> None:
+    covered = np.full(20, 0.01)
+    # 3 of 20 are 15 %, and equal but for rounding is not beyond
+    assert find_threshold(covered, np.array([0.01 + 1e-10] * 17 + [0.02] * 3)) == pytest.approx((0.01, 0.15))
+    raised, share = find_threshold(covered, np.array([0.01] * 16 + [0.02] * 4))
+    assert (raised, share) == pytest.approx((0.02, 0.0))
+    raised, share = find_threshold(covered, np.array([0.0] * 30 + [0.02] * 9 + [0.03] * 2))
+    assert (raised, share) == pytest.approx((0.02, 2 / 41))
+    assert np.isnan(find_threshold(np.zeros(0), np.ones(3))).all()
+
+
+def test_windows_of_checks_set_no_threshold_but_count_as_false_alarms() -> None:
+    checks = [{**window(0.0, 0.5, seed=k), "is_check": True} for k in range(3)]
+    rows = [{**row, "is_check": False} for row in (*null_windows(), window(0.02, 0.0195), window(0.02, 0.0191))]
+    (row,) = detection_limits(pd.DataFrame([*rows, *checks]))
+    # that of 20 mm and three more are 4 of 24 beyond 19 mm, 17 %: it rises
+    assert (row["threshold_m"], row["n_null_windows"], row["false_share"]) == pytest.approx((0.5, 21, 0.0))
+    assert row["found_share"] == 0.0
+    (row,) = detection_limits(pd.DataFrame([*rows, *checks[:2]]))
+    assert (row["threshold_m"], row["false_share"], row["found_share"]) == pytest.approx((0.019, 3 / 23, 1.0))
+    # rows of an older run do not say so; of both together those that do count
+    (row,) = detection_limits(pd.DataFrame([*null_windows(), window(0.02, 0.0195), *checks[:1]]))
+    assert (row["threshold_m"], row["n_null_windows"]) == pytest.approx((0.019, 21))
 
 
 @pytest.mark.parametrize(
