@@ -112,6 +112,8 @@ def test_the_seconds_are_the_answers_own_and_rates_need_a_path_and_an_answer() -
     report = report_of(truth, field)
     found = score_surface(Answer("ok", "", "m", report, {"t_surface_s": 2.5}, {}), truth, 40.0).columns
     assert (found["t_surface_s"], found["surface_false_regions_per_100m"]) == (2.5, 2.5)
+    short = score_surface(Answer("ok", "", "m", report, {}, {}), truth, 0.5).columns
+    assert short["surface_false_regions_per_100m"] == 200.0
     assert np.isnan(score_surface(Answer("ok", "", "m", report, {}, {}), truth, 0.0).columns[
         "surface_false_regions_per_100m"])  # fmt: skip
     none = score_surface(Answer("failed", "", "m", None, {}, {}), truth, 40.0).columns

@@ -337,3 +337,20 @@ def test_a_row_of_a_surface_change_by_hand() -> None:
     assert score.row["surface_recall"] == 0.5
     region[core[3]] = -1
     assert not score_field(truth, replace(field, region=region)).surface_changes[0]["is_found"]
+
+
+def test_the_core_of_a_change_is_what_moved_at_least_half_as_far_and_a_row_names_the_partner() -> None:
+    truth = wall_truth({1: (5, 1, 1, 1, 0.125), 2: (9, 1, 1, 1, -0.25)}, kinds={1: "rubble", 2: "scar"})
+    surface, points = truth.before.surface, truth.before.scoring_points.points_odom
+    is_shallow = (surface.change == 1) & (points[:, 2] > 1.75)
+    linked = tuple(replace(each, partner=3 - each.id) for each in truth.pair.surface_changes)
+    for depth_m, n_core in ((0.0625, 16), (0.0624, 12)):
+        depth = np.where(is_shallow, depth_m, surface.displacement_m).astype(np.float32)
+        before = replace(truth.before, surface=replace(surface, displacement_m=depth))
+        own = replace(
+            truth, pair=replace(truth.pair, surface_changes=linked), sessions={**truth.sessions, "before": before}
+        )
+        first, second = score_field(own, None).surface_changes
+        assert (first["n_core_places"], second["n_core_places"]) == (n_core, 16)
+        assert (first["partner"], second["partner"]) == (2, 1)
+        assert (first["n_places"], first["found_share"], first["cover"]) == (16, 0.0, 0.0)
