@@ -176,7 +176,8 @@ def _answered_volume(
     is_held = places.is_judged & places.is_changed & (said.region >= 0)
     for region in np.unique(said.region[is_held & (places.change == change)]):
         n_of_change = np.bincount(places.change[is_held & (said.region == region)])
-        n_of_change[0] = 0  # changed places of no change belong to nobody
+        # changed places of no change belong to nobody
+        n_of_change[0] = 0
         volume_m3 = surface.regions[region].volume_m3
         if n_of_change[change] == n_of_change.max() and np.sign(volume_m3) == sign:
             total_m3 += volume_m3

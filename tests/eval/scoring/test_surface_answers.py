@@ -138,6 +138,10 @@ def test_levels_of_the_rock_by_hand() -> None:
     assert found["surface_level_median_m"] == 0.01
     assert found["surface_cover"] == pytest.approx(37 / 120)
     assert (found["surface_cover_changed"], found["surface_cover_unchanged"]) == (0.0, pytest.approx(37 / 100))
+    # no displacement at all: what has no level is not inside
+    silent = replace(field, displacement_m=np.zeros(2400), level_m=np.full(2400, NAN))
+    assert score_field(truth, silent).row["surface_level_inside"] == 0.0
+    assert score_field(truth, None).row["surface_level_inside"] == 0.0
     everything = wall_truth({1: (-1, -1, 40, 10, 0.2)})
     none = score_answer(Answer("failed", "", "m", None, {}, {}), everything).row
     assert np.isnan(
@@ -171,3 +175,51 @@ def test_volumes_by_hand() -> None:
     assert score_field(plain, None).row["surface_volume_error_share"] == 1.0
     half = tuple(replace(each, volume_m3=0.5 * each.volume_m3) for each in field.regions)
     assert score_field(plain, replace(field, regions=half)).row["surface_volume_error_share"] == pytest.approx(0.5)
+
+
+def test_a_region_belongs_to_the_change_of_most_judged_places_that_moved() -> None:
+    truth = wall_truth({1: (17, 1, 1, 2, 0.1), 2: (24, 1, 4, 3, 0.2), 3: (5, 1, 1, 1, 0.3)}, unseen_from_m=20.0)
+    field = true_field(truth)
+    # one region on what was seen of 1, and on all of 2, which nobody could judge; change 3 is not answered
+    region = np.where(np.isin(field.region, (0, 1)), 0, -1).astype(np.int32)
+    regions = (replace(field.regions[0], volume_m3=0.25),)
+    first, second, third = score_field(truth, replace(field, region=region, regions=regions)).surface_changes
+    assert [row["answered_volume_m3"] for row in (first, second, third)] == [0.25, 0.0, 0.0]
+    assert (second["n_places"], second["is_observable"]) == (0, False)
+
+
+def test_rock_that_moved_and_belongs_to_no_change_takes_no_region_away() -> None:
+    truth = wall_truth({1: (5, 1, 2, 2, 0.1), 2: (9, 1, 1, 1, 0.2)})
+    surface = truth.before.surface
+    before = replace(truth.before, surface=replace(surface, change=np.where(surface.change == 1, 0, surface.change)))
+    truth = replace(truth, sessions={**truth.sessions, "before": before})
+    field = true_field(wall_truth({1: (5, 1, 2, 2, 0.1), 2: (9, 1, 1, 1, 0.2)}))
+    region = np.where(field.region >= 0, 0, -1).astype(np.int32)
+    _, second = score_field(truth, replace(field, region=region, regions=field.regions[:1])).surface_changes
+    assert second["answered_volume_m3"] == pytest.approx(0.4)
+
+
+def test_a_change_without_a_volume_has_no_error_of_it() -> None:
+    truth = wall_truth({1: (5, 1, 2, 2, 0.1)}, kinds={1: "scar"})
+    changes = tuple(replace(each, volume_m3=0.0) for each in truth.pair.surface_changes)
+    score = score_field(replace(truth, pair=replace(truth.pair, surface_changes=changes)), None)
+    assert np.isnan(score.surface_changes[0]["volume_error_share"])
+    assert np.isnan(score.row["surface_volume_error_share"])
+
+
+def test_errors_of_distinct_values_by_hand() -> None:
+    # 120 columns of 20 places; column k is answered k tenths of a millimetre; columns 40 to 79 moved by -0.1 m
+    truth = wall_truth({1: (10, 0, 10, 5, -0.1)})
+    field = true_field(truth)
+    column = np.floor(field.points_map[:, 0] / 0.25)
+    found = score_field(truth, replace(field, displacement_m=1e-4 * column)).row
+    error = 1e-4 * np.arange(120) + np.where((np.arange(120) >= 40) & (np.arange(120) < 80), 0.1, 0.0)
+    parts = {"": error, "_changed": error[40:80], "_unchanged": np.r_[error[:40], error[80:]]}
+    for part, of_part in parts.items():
+        of_places = np.repeat(of_part, 20)
+        assert found[f"surface_error_median{part}_m"] == pytest.approx(np.median(of_places), abs=1e-8)
+        assert found[f"surface_error_p95{part}_m"] == pytest.approx(np.percentile(of_places, 95), abs=1e-8)
+        # too much into the void is too little of what moved out of it
+        bias_m = -of_part.mean() if part == "_changed" else of_part.mean()
+        assert found[f"surface_bias{part}_m"] == pytest.approx(bias_m, abs=1e-8)
+        assert found[f"surface_cover{part}"] == 1.0

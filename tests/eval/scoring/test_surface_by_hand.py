@@ -354,3 +354,4 @@ def test_the_core_of_a_change_is_what_moved_at_least_half_as_far_and_a_row_names
         assert (first["n_core_places"], second["n_core_places"]) == (n_core, 16)
         assert (first["partner"], second["partner"]) == (2, 1)
         assert (first["n_places"], first["found_share"], first["cover"]) == (16, 0.0, 0.0)
+        assert (first["answered_volume_m3"], second["answered_volume_m3"]) == (0.0, 0.0)

@@ -220,6 +220,13 @@ def test_being_silent_where_thresholds_come_from_does_not_pay() -> None:
     assert [(row["found_share"], row["false_share"]) for row in rows] == [(0.0, 0.0)] * 4
 
 
+@pytest.mark.parametrize("everywhere_m", [0.03, 0.07, 0.3, -0.05])
+def test_one_value_everywhere_finds_nothing(truth: GroundTruth, everywhere_m: float) -> None:
+    # its means over more or fewer places differ by rounding, and half of them exceed the threshold by that
+    rows = limits_of(score_field(truth, field_that_says(truth, np.full(2400, everywhere_m))))
+    assert [(row["found_share"], row["false_share"]) for row in rows] == [(0.0, 0.0)] * len(rows)
+
+
 def test_covering_less_than_half_of_every_window_but_a_silent_one_does_not_pay(truth: GroundTruth) -> None:
     field, places = true_field(truth), find_surface_places(truth)
     x = field.points_map[:, 0]
