@@ -155,6 +155,24 @@ def test_a_row_that_its_answer_does_not_earn_is_found(evaluated: RunFolder, pack
         score_again(found, evaluated)
 
 
+@pytest.mark.parametrize(
+    "claim",
+    [{"object_iou_point": float("nan")}, {"false_regions_per_100m": None}, {"t_total_s": 0.0}, {"n_objects": 99}],
+)
+def test_no_column_of_a_row_can_be_left_out_or_bettered(
+    evaluated: RunFolder, packed: Path, claim: dict[str, Any]
+) -> None:
+    (name,) = claim
+    with pytest.raises(InputError, match=f"{name} = .* in its row, and its answer scores"):
+        score_again(read_submission(rewrite(packed, in_row(**claim))), evaluated)
+
+    def without(document: dict[str, Any]) -> None:
+        del document["pairs"][0]["row"][name]
+
+    with pytest.raises(InputError, match=f"{name} = None in its row"):
+        score_again(read_submission(rewrite(packed, in_manifest(without))), evaluated)
+
+
 def without_answer(**values: Any) -> Change:
     """Claim that the first pair cannot be made, with values in its row."""
 

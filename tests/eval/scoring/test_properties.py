@@ -355,3 +355,27 @@ def test_every_share_is_a_share(seed: int) -> None:
     if truth.n_observable:
         never_nan = [name for name in SHARES if name.startswith("region_r") or name == "kind_accuracy"]
         assert not np.isnan([row[name] for name in never_nan]).any()
+
+
+@EXAMPLES
+@given(SEEDS)
+def test_accuracies_of_points_pay_neither_silence_nor_noise(seed: int) -> None:
+    truth = drawn_truth(seed)
+    report = true_report(truth)
+    right, silent = row_of(truth, report), row_of(truth, without_anything(report))
+    # objects on unobservable and partial changes hold no static point
+    assert (right["static_accuracy"], silent["static_accuracy"]) == (1.0, 1.0)
+    wrong = row_of(truth, with_wrong_object(truth, report, seed))
+    assert wrong["static_accuracy"] < 1.0
+    assert wrong["dynamic_accuracy"] == right["dynamic_accuracy"] or np.isnan(right["dynamic_accuracy"])
+    everything = [np.arange(len(truth.sessions[name].scoring_points)) for name in ("before", "after")]
+    points = [truth.sessions[name].scoring_points for name in ("before", "after")]
+    objects = tuple(
+        ChangedObject(name, "added", -1, np.column_stack([of.scans(rows), of.pixels(rows)]).astype(np.int32),
+                      of.points_odom[rows].astype(np.float64), 1.0)
+        for name, of, rows in zip(("before", "after"), points, everything, strict=True)
+    )  # fmt: skip
+    loud = row_of(truth, replace(report, objects=objects))
+    assert loud["static_accuracy"] == 0.0
+    for row in (silent, loud):
+        assert np.isnan(row["associated_accuracy"]) or row["associated_accuracy"] == 0.0

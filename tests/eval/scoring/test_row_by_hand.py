@@ -203,6 +203,18 @@ def test_false_regions_on_movers(
     assert columns["n_false_regions"] == 1
 
 
+@pytest.mark.parametrize(("path_m", "rate"), [(0.0, NAN), (0.5, 200.0), (1.0, 100.0)])
+def test_the_rate_of_false_regions_on_movers_needs_a_path(
+    report: ChangeReport, truth: GroundTruth, path_m: float, rate: float
+) -> None:
+    # the false region lies at x = 35
+    after = replace(truth.after, seen_movers_world=np.array([(35.0, 0.0, 0.0)]))
+    seen = replace(truth, sessions={"before": truth.before, "after": after})
+    columns = score_regions(report, seen, np.linspace(0.0, path_m, 51)).columns
+    assert columns["n_false_regions_on_movers"] == 1
+    assert columns["false_regions_on_movers_per_100m"] == pytest.approx(rate, nan_ok=True)
+
+
 def test_the_changes(case: CaseScore) -> None:
     for name, values in {
         "id": [1, 2, 3],
