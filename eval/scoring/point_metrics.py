@@ -38,17 +38,15 @@ def score_points(objects: Sequence[ChangedObject], rows: Sequence[Int64Array], t
         is_answered = np.zeros(len(labels), dtype=np.bool_)
         for item, of_object in zip(objects, rows, strict=True):
             is_answered[of_object if item.session == session else []] = True
-        of_session = [change.id for change, is_its in zip(truth.pair.changes, is_main, strict=True)
-                      if is_its and change.session == session]  # fmt: skip
+        main = [truth.pair.changes[index] for index in np.flatnonzero(is_main)]
+        of_session = [change.id for change in main if change.session == session]
         is_static, is_dynamic = labels == 0, np.isin(labels, of_session)
         n_points += (np.count_nonzero(is_static), np.count_nonzero(is_dynamic))
         n_right += (np.count_nonzero(is_static & ~is_answered), np.count_nonzero(is_dynamic & is_answered))
-    static, dynamic = (
-        right / n if n else math.nan for right, n in zip(n_right.tolist(), n_points.tolist(), strict=True)
-    )
+    static, dynamic = (n_right[k] / n_points[k] if n_points[k] else math.nan for k in range(2))
     return {
-        "static_accuracy": static,
-        "dynamic_accuracy": dynamic,
+        "static_accuracy": float(static),
+        "dynamic_accuracy": float(dynamic),
         "associated_accuracy": math.sqrt(static * dynamic),
     }
 

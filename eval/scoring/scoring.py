@@ -235,6 +235,7 @@ def make_region_rows(report: ChangeReport | None, scored: RegionScores, truth: G
             "is_withdrawn": bool(is_withdrawn[index]),
             "outcome": scored.matches.outcomes[index],
             **dict(zip(("x_m", "y_m", "z_m"), map(float, regions.centres_map[index]), strict=True)),
+            "radius_m": float(regions.radii_m[index]),
             "found_changes": ";".join(str(truth.pair.changes[change].id) for change in scored.matches.found[index]),
             "found_changes_proposed": ";".join(
                 str(truth.pair.changes[change].id) for change in scored.proposed.found[index]

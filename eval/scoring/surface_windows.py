@@ -81,8 +81,6 @@ def _windows(points: Float64Array, change: Int64Array, is_changed: BoolArray) ->
     Centres in a change come deepest inside first and stand 2 m apart. A window that is not wholly on its change is
     taken only where no other is.
     """
-    if len(points) == 0:
-        return
     tree = cKDTree(points)
     for number in [*np.unique(change[is_changed & (change > 0)]).tolist(), 0]:
         is_its = is_changed & (change == number) if number else ~is_changed
@@ -116,10 +114,7 @@ def _check_windows(
     The windows that set a threshold lie at one end of a long drift. The order of these follows from how many places
     did not move, which nobody knows without the truth, so that no answer can be silent in them alone.
     """
-    unmoved = np.flatnonzero(~is_changed)
-    if len(unmoved) == 0:
-        return
-    tree = cKDTree(points)
+    unmoved, tree = np.flatnonzero(~is_changed), cKDTree(points)
     for area_m2 in AREAS_M2:
         radius_m, apart_m = _null_lengths(area_m2)
         is_free = ~is_changed

@@ -8,7 +8,8 @@ A method lets somebody look at its candidates, best first. Each look has a price
   before session (descriptors, or the map itself), and the points of the before map in each sphere that is looked at.
 
 A change is found at the price of the first look whose sphere, as it was proposed, finds it. It costs infinitely much
-where no candidate does, and where the pair has no answer.
+where no candidate does, and where the pair has no answer. A sphere finds what lies within the score radius, however
+small it is. So one below 0.4 score radii, smaller than any of ours, is charged as the whole map.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ BUDGETS: Mapping[str, tuple[float, ...]] = MappingProxyType({
 # the share of the map's bytes up to which the area is taken
 _AREA_ENDS = {"spheres": 12.0, "seconds": 10.0, "bytes": 0.1}
 BYTES_PER_POINT = 12
+# widths of drifts give spheres of 4.5 m and more, where the score radius is 10 m at most
+_LEAST_RADIUS = 0.4
 
 
 def budget_rows(ranked: RankedPairs, results: pd.DataFrame, regions: pd.DataFrame) -> list[dict[str, Any]]:
@@ -74,7 +77,7 @@ def price_changes(ranked: RankedPairs, results: pd.DataFrame, regions: pd.DataFr
         dict(zip(cases.index, numbers(cases, name), strict=True))
         for name in ("after_path_m", "t_cd_s", "look_s", "bytes_regions_before", "bytes_map_before")
     )
-    asked = _asked_bytes(regions)
+    asked = _asked_bytes(results, regions)
     prices = {name: np.full(len(ranked.change_pair), np.inf) for name in BUDGETS}
     for change in np.flatnonzero(np.isfinite(ranked.change_score)).tolist():
         pair, n_looks = ranked.pairs[ranked.change_pair[change]], int(ranked.change_rank[change]) + 1
@@ -86,29 +89,38 @@ def price_changes(ranked: RankedPairs, results: pd.DataFrame, regions: pd.DataFr
     return prices
 
 
-def _asked_bytes(regions: pd.DataFrame) -> dict[tuple[str, int], Float64Array]:
+def _asked_bytes(results: pd.DataFrame, regions: pd.DataFrame) -> dict[tuple[str, int], Float64Array]:
     """Return the bytes of all spheres up to each candidate of a pair, best first."""
     if not len(regions):
         return {}
     # sorted at once: a frame for each of thousands of pairs takes most of the time of a table
     place = regions.groupby(PAIR, sort=False).ngroup().to_numpy()
     order = np.lexsort((-numbers(regions, "score"), place))
-    points, ends = numbers(regions, ASKED_POINTS)[order], np.flatnonzero(np.diff(place[order])) + 1
+    asked, ends = _bytes_per_look(results, regions)[order], np.flatnonzero(np.diff(place[order])) + 1
     firsts = order[np.concatenate([[0], ends])]
     names = zip(regions["scenario"].iloc[firsts], regions["seed"].iloc[firsts], strict=True)
-    parts = np.split(points, ends)
-    return {
-        (str(name), int(seed)): BYTES_PER_POINT * np.cumsum(own) for (name, seed), own in zip(names, parts, strict=True)
-    }
+    parts = np.split(asked, ends)
+    return {(str(name), int(seed)): np.cumsum(own) for (name, seed), own in zip(names, parts, strict=True)}
+
+
+def _bytes_per_look(results: pd.DataFrame, regions: pd.DataFrame) -> Float64Array:
+    """Return (R,) the bytes that each candidate's sphere asks for; the whole map where it is smaller than it may be."""
+    asked = BYTES_PER_POINT * numbers(regions, ASKED_POINTS)
+    is_small = numbers(regions, "radius_m") < _LEAST_RADIUS * _of_pairs(results, regions, "score_radius_m")
+    return np.where(is_small, np.fmax(asked, _of_pairs(results, regions, "bytes_map_before")), asked)
 
 
 def _share_of_a_look(results: pd.DataFrame, regions: pd.DataFrame) -> float:
     """Return the mean of what each candidate asks for as a share of its map; NaN where one does not state it."""
     if not len(regions):
         return math.nan
-    whole = dict(zip(results.set_index(PAIR).index, numbers(results, "bytes_map_before"), strict=True))
-    own = np.array([whole.get(pair, math.nan) for pair in zip(regions["scenario"], regions["seed"], strict=True)])
-    return float(np.mean(BYTES_PER_POINT * numbers(regions, ASKED_POINTS) / own))
+    return float(np.mean(_bytes_per_look(results, regions) / _of_pairs(results, regions, "bytes_map_before")))
+
+
+def _of_pairs(results: pd.DataFrame, regions: pd.DataFrame, column: str) -> Float64Array:
+    """Return (R,) a column of results.csv for the pair of each candidate."""
+    of_pair = dict(zip(results.set_index(PAIR).index, numbers(results, column), strict=True))
+    return np.array([of_pair.get(pair, math.nan) for pair in zip(regions["scenario"], regions["seed"], strict=True)])
 
 
 def _seconds_per_look(results: pd.DataFrame) -> Float64Array:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cdpipe.core.geometry import make_pose
+from cdpipe.core.geometry import make_pose, stream
 from cdpipe.model.report import SurfaceField, SurfaceRegion
 from eval.scoring import surface_windows
 from eval.scoring.surface_places import (
@@ -355,3 +355,81 @@ def test_the_core_of_a_change_is_what_moved_at_least_half_as_far_and_a_row_names
         assert (first["partner"], second["partner"]) == (2, 1)
         assert (first["n_places"], first["found_share"], first["cover"]) == (16, 0.0, 0.0)
         assert (first["answered_volume_m3"], second["answered_volume_m3"]) == (0.0, 0.0)
+
+
+def list_slowly(places: SurfacePlaces, n_null: int, n_check: int) -> list[tuple[float, int, int]]:
+    """Area, change and centre of every window, by loops over all pairs of places: a slow twin of `find_windows`."""
+    points, is_changed = places.points_map, places.is_changed
+    gaps = np.linalg.norm(points[:, None] - points, axis=2)
+    found: list[tuple[float, int, int]] = []
+
+    def take(area_m2: float, number: int, order: list[int], apart_m: float, most: int, earlier: list[int]) -> None:
+        taken: list[int] = []
+        for centre in order:
+            near = np.flatnonzero(gaps[centre] <= np.sqrt(area_m2 / np.pi))
+            its = is_changed[near] & (places.change[near] == number) if number else ~is_changed[near]
+            is_far = all(gaps[centre, each] >= apart_m for each in (*earlier, *taken))
+            is_full = len(near) * 0.25**2 >= area_m2 / 2
+            if len(taken) < most and is_far and is_full and (its.all() or (number and not taken)):
+                taken.append(centre)
+        found.extend((area_m2, number, centre) for centre in taken)
+
+    for number in sorted({int(each) for each in places.change[is_changed]} - {0}):
+        own = np.flatnonzero(is_changed & (places.change == number))
+        others = np.setdiff1d(np.arange(len(points)), own)
+        order = sorted(own.tolist(), key=lambda index: (-gaps[index, others].min(initial=np.inf), index))
+        for area_m2 in (1.0, 4.0, 16.0):
+            take(area_m2, number, order, 2.0, len(points), [])
+    still = np.flatnonzero(~is_changed)
+    apart = {area_m2: max(2.0, 2 * np.sqrt(area_m2 / np.pi)) for area_m2 in (1.0, 4.0, 16.0)}
+    for area_m2, apart_m in apart.items():
+        take(area_m2, 0, still.tolist(), apart_m, n_null, [])
+    sets = list(found)
+    for area_m2, apart_m in apart.items():
+        order = stream(len(still), "check windows").permutation(still).tolist()
+        take(area_m2, 0, order, apart_m, n_check, [each[2] for each in sets if each[:2] == (area_m2, 0)])
+    return found
+
+
+@pytest.mark.parametrize(
+    "places",
+    [
+        grid(40, 40, box(range(4, 34), range(4, 34))),  # large enough for windows of 16 m2 side by side
+        grid(41, 20, {**box(range(3, 16), range(0, 9), 1), **box(range(16, 24), range(2, 18), 4)}),
+        grid(30, 9, {**box(range(9), range(9), 0), **box(range(18, 20), range(9), 2)}),
+        grid(28, 8),
+    ],
+)
+def test_windows_equal_those_of_a_slow_twin(places: SurfacePlaces, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(surface_windows, "MAX_NULL_WINDOWS", 3)
+    monkeypatch.setattr(surface_windows, "MAX_CHECK_WINDOWS", 5)
+    # some rock moved and belongs to no change, some of a change did not move
+    true_m = places.true_m.copy()
+    true_m[-3:] = 0.5
+    true_m[np.flatnonzero(places.change > 0)[:2]] = 0.0
+    places = replace(places, true_m=true_m)
+    windows, checks = find_windows(places)
+    assert [each[:3] for each in (*windows, *checks)] == list_slowly(places, 3, 5)
+
+
+def test_one_place_and_a_point_exactly_30_cm_away() -> None:
+    for at_m, is_covered in ((0.3, True), (-0.3, True), (np.nextafter(0.3, 1.0), False)):
+        said = carry_surface(field_at([at_m], [0.1]), places_at(0.0))
+        assert (said.is_covered.tolist(), said.answered_m.tolist()) == ([is_covered], [0.1 if is_covered else 0.0])
+
+
+def test_points_that_are_repeated_hundreds_of_times_count_once() -> None:
+    draw = stream(0, "repeated")
+    x = np.repeat(draw.uniform(0, 100, 300), 4)
+    displacement = np.tile([0.4, 0.1, 0.3, 0.2], 300)
+    order = draw.permutation(1200)
+    said = carry_surface(field_at(x[order].tolist(), displacement[order].tolist()), places_at(*x[::4]))
+    assert set(said.answered_m.tolist()) == {0.1}
+
+
+def test_without_a_field_there_is_no_region_and_no_false_one() -> None:
+    truth = wall_truth({1: (5, 1, 2, 2, -0.1)})
+    row = score_field(truth, None).row
+    assert (row["n_surface_regions"], row["surface_false_regions_per_100m"]) == (0, 0.0)
+    assert (row["surface_region_precision"], row["surface_recall"], row["n_surface_changes"]) == (0.0, 0.0, 1)
+    assert np.isnan(score_field(wall_truth({}), None).row["surface_region_precision"])

@@ -76,14 +76,22 @@ def test_no_change_has_no_budget() -> None:
     assert budget_rows(*tables([{"seed": 1, "n_observable": 0}], [(1, 9.0, "", 10)], [])) == []
 
 
-def test_small_spheres_cost_few_bytes_and_the_share_that_a_look_asks_for_shows_them() -> None:
-    for n_points, share in ((100, 0.1), (1, 0.001)):
-        looks = [(1, 9.0, "1", n_points), (1, 8.0, "", n_points)]
-        rows = budget_rows(*tables([{"seed": 1, "bytes_regions_before": 0.0}], looks, [(1, 1)]))
-        of_bytes = {row["budget"]: row for row in rows if row["price"] == "bytes"}
-        assert of_bytes[0.01]["recall"] == float(share <= 0.01)
-        assert [row["asked_share"] for row in of_bytes.values()] == pytest.approx([share] * len(of_bytes))
-        assert np.isnan([row["asked_share"] for row in rows if row["price"] != "bytes"]).all()
+def test_a_sphere_that_is_smaller_than_it_may_be_is_charged_as_the_whole_map() -> None:
+    # the score radius is 4.5 m, so spheres from 1.8 m on are charged by their points
+    for radius_m, asked_share, price in ((1.79, (1.0 + 0.1) / 2, 1.0), (1.8, (0.001 + 0.1) / 2, 0.001)):
+        looks = [(1, 9.0, "1", 1), (1, 8.0, "", 100)]
+        ranked, results, regions = tables([{"seed": 1, "bytes_regions_before": 0.0}], looks, [(1, 1)])
+        regions = regions.assign(radius_m=[radius_m, 4.5])
+        assert price_changes(ranked, results, regions)["bytes"].tolist() == pytest.approx([price])
+        of_bytes = [row for row in budget_rows(ranked, results, regions) if row["price"] == "bytes"]
+        assert [row["asked_share"] for row in of_bytes] == pytest.approx([asked_share] * len(of_bytes))
+
+
+def test_the_share_of_the_map_that_a_look_asks_for() -> None:
+    rows = budget_rows(*tables([{"seed": 1}], [(1, 9.0, "1", 100), (1, 8.0, "", 50)], [(1, 1)]))
+    shares = [row["asked_share"] for row in rows if row["price"] == "bytes"]
+    assert shares == pytest.approx([0.075] * len(shares))
+    assert np.isnan([row["asked_share"] for row in rows if row["price"] != "bytes"]).all()
     unstated = budget_rows(*tables([{"seed": 1}], [(1, 9.0, "1", 5), (1, 8.0, "", NAN)], [(1, 1)]))
     assert np.isnan([row["asked_share"] for row in unstated]).all()
     silent = budget_rows(*tables([{"seed": 1}], [], [(1, 1)]))
