@@ -203,6 +203,13 @@ def test_false_regions_on_movers(
     assert columns["n_false_regions"] == 1
 
 
+def test_a_case_without_an_answer_has_the_columns_of_one_with_an_answer(
+    report: ChangeReport, truth: GroundTruth
+) -> None:
+    answered = score_regions(report, truth, np.arange(51.0)).columns
+    assert set(score_unanswered_regions(truth).columns) == set(answered)
+
+
 @pytest.mark.parametrize(("path_m", "rate"), [(0.0, NAN), (0.5, 200.0), (1.0, 100.0)])
 def test_the_rate_of_false_regions_on_movers_needs_a_path(
     report: ChangeReport, truth: GroundTruth, path_m: float, rate: float
