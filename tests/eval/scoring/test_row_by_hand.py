@@ -210,6 +210,22 @@ def test_a_case_without_an_answer_has_the_columns_of_one_with_an_answer(
     assert set(score_unanswered_regions(truth).columns) == set(answered)
 
 
+def test_withdrawn_regions_alone_have_no_place_among_the_k_best(report: ChangeReport, truth: GroundTruth) -> None:
+    is_withdrawn = np.array([False, False, False, False, False, True, False])
+    kept = replace(report, regions=replace(report.regions, is_withdrawn=is_withdrawn))
+    assert score_regions(kept, truth, np.arange(51.0)).columns["region_recall_at_k"] == 1.0
+
+
+def test_without_a_region_none_is_false(report: ChangeReport, truth: GroundTruth) -> None:
+    nothing = ChangeRegions(
+        np.zeros((0, 3)), 2.0, np.zeros(0), np.zeros((0, 2), np.int64), np.zeros(0, np.bool_), np.zeros(0)
+    )
+    after = replace(truth.after, seen_movers_world=np.array([(35.0, 0.0, 0.0)]))
+    seen = replace(truth, sessions={"before": truth.before, "after": after})
+    columns = score_regions(replace(report, regions=nothing), seen, np.arange(51.0)).columns
+    assert (columns["n_false_regions_on_movers"], columns["false_regions_on_movers_per_100m"]) == (0, 0.0)
+
+
 @pytest.mark.parametrize(("path_m", "rate"), [(0.0, NAN), (0.5, 200.0), (1.0, 100.0)])
 def test_the_rate_of_false_regions_on_movers_needs_a_path(
     report: ChangeReport, truth: GroundTruth, path_m: float, rate: float

@@ -433,3 +433,16 @@ def test_without_a_field_there_is_no_region_and_no_false_one() -> None:
     assert (row["n_surface_regions"], row["surface_false_regions_per_100m"]) == (0, 0.0)
     assert (row["surface_region_precision"], row["surface_recall"], row["n_surface_changes"]) == (0.0, 0.0, 1)
     assert np.isnan(score_field(wall_truth({}), None).row["surface_region_precision"])
+
+
+def test_a_window_of_checks_needs_half_of_its_cells_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(surface_windows, "MAX_NULL_WINDOWS", 1)
+    # two blocks of 3 x 3 places 5 m apart; 8 of 16 cells are enough, 7 are not
+    block = grid(3, 3).points_map
+    for n_places, n_checks in ((8, 1), (7, 0)):
+        points = np.concatenate([block, block[:n_places] + np.array([5.0, 0.0, 0.0])])
+        n = len(points)
+        places = SurfacePlaces(points, np.zeros(n), np.zeros(n, np.int64), np.ones(n, np.bool_))
+        windows, checks = find_windows(places)
+        assert [len(each[3]) for each in windows] == [8]  # about a corner
+        assert [len(each[3]) for each in checks] == [8] * n_checks
