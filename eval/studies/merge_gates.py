@@ -2,7 +2,7 @@
 
 Run as `python -m eval.studies.merge_gates RUN --out DIR`, where RUN is the folder of `tunnelcd run merge-gates`. Its
 variant sets `merge.accept_all`, so that every best hypothesis is kept with its evidence, right or wrong. The program
-writes DIR/gates.csv and DIR/gates.png. Thresholds go into cdpipe/model/config.py by hand, so that none changes
+writes DIR/gates.csv and DIR/gates.png. Thresholds go into cdpipe/model/config/mapping.py by hand, so that none changes
 unnoticed.
 
 The search stops at the present gates even under `merge.accept_all`: the next candidate, and KISS-Matcher, are tried

@@ -6,9 +6,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from cdpipe.core.yamlfile import Settings
+from cdpipe.core.yamlfile import GrownSettings, Settings
 from scenarios.schema.values import (
-    Lean,
     NotNegative,
     Positive,
     Reflectivity,
@@ -49,10 +48,10 @@ USUAL_MOVERS: dict[str, dict[str, Any]] = {
 }
 
 
-class Mover(Lean):
+class Mover(GrownSettings):
     """Something that moves while a session is recorded; never a change. sim/movers/MOVERS.md has every kind."""
 
-    _LATER: ClassVar[frozenset[str]] = frozenset({"dust_mg_per_m"})
+    newer: ClassVar[frozenset[str]] = frozenset({"dust_mg_per_m"})
 
     name: str
     kind: Literal["person", "forklift", "loader", "curtain"]

@@ -6,7 +6,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from scenarios.schema.values import Lean, NotNegative, Positive
+from cdpipe.core.yamlfile import GrownSettings
+from scenarios.schema.values import NotNegative, Positive
 
 DEFAULT_SOURCE = "drift"
 # The random walk fitted to KISS-ICP on validation pairs of narrow, wide and cave together: sim/drive/DRIVES.md.
@@ -36,7 +37,7 @@ def source_of(odometry: dict[str, Any]) -> Any:
     return odometry.get("source", "file" if "file" in odometry else DEFAULT_SOURCE)
 
 
-class Odometry(Lean):
+class Odometry(GrownSettings):
     """What a session's poses come from.
 
     - `drift`: truth with a systematic error in KITTI's terms, its signs drawn from the seed; both figures 0: truth.
@@ -47,7 +48,7 @@ class Odometry(Lean):
     - `file`: the poses of a TUM file; naming the file is enough.
     """
 
-    _LATER: ClassVar[frozenset[str]] = frozenset({*FITTED_WALK, "file"})
+    newer: ClassVar[frozenset[str]] = frozenset({*FITTED_WALK, "file"})
 
     source: Literal["drift", "kiss-icp", "random-walk", "file"] = "drift"
     translation_percent: NotNegative = 0.0

@@ -6,8 +6,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from cdpipe.core.yamlfile import Settings
-from scenarios.schema.values import Finite, Lean, NotNegative, Positive
+from cdpipe.core.yamlfile import GrownSettings, Settings
+from scenarios.schema.values import Finite, NotNegative, Positive
 
 
 class Gait(Settings):
@@ -28,10 +28,10 @@ GAITS: dict[str, dict[str, float]] = {
 }
 
 
-class Platform(Lean):
+class Platform(GrownSettings):
     """What carries the sensor, and how the sensor is mounted on it."""
 
-    _LATER: ClassVar[frozenset[str]] = frozenset({"mount_yaw_deg", "mount_pitch_deg", "gait"})
+    newer: ClassVar[frozenset[str]] = frozenset({"mount_yaw_deg", "mount_pitch_deg", "gait"})
 
     kind: Literal["ground_robot", "quadrotor", "handheld", "legged"] = "ground_robot"
     sensor_height_m: Positive = 0.8  # above the floor

@@ -6,9 +6,9 @@ from typing import Annotated, ClassVar, Literal, get_args
 
 from pydantic import Field, model_validator
 
-from cdpipe.core.yamlfile import Settings
+from cdpipe.core.yamlfile import GrownSettings, Settings
 from scenarios.schema.tunnel import MeshFile
-from scenarios.schema.values import Finite, Lean, Positive, Reflectivity, Share, SignedShare
+from scenarios.schema.values import Finite, Positive, Reflectivity, Share, SignedShare
 
 PropKind = Literal[
     "box", "crate", "chair", "trolley", "barrel", "cone", "railing", "pallet", "rock", "vehicle", "muck_pile", "mesh"
@@ -77,10 +77,10 @@ class Aged(Settings):
     sag_m: Annotated[float, Field(ge=0, le=0.2)] = 0.0  # into the floor
 
 
-class Prop(Lean):
+class Prop(GrownSettings):
     """An object on the floor. What happens to it between the sessions is its `change`."""
 
-    _LATER: ClassVar[frozenset[str]] = frozenset({"aged"})
+    newer: ClassVar[frozenset[str]] = frozenset({"aged"})
 
     name: str
     kind: str  # a PropKind, or the name of a prop on the search path, which has a mesh

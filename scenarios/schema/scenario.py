@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 from pydantic import model_validator
 
+from cdpipe.core.yamlfile import GrownSettings
 from scenarios.dangling import find_dangling
 from scenarios.schema.movers import Mover
 from scenarios.schema.platform import Platform
@@ -15,7 +16,7 @@ from scenarios.schema.sensor import Sensor, Simulation
 from scenarios.schema.session import SessionPlan
 from scenarios.schema.surface import SurfaceChange
 from scenarios.schema.tunnel import Tunnel
-from scenarios.schema.values import Lean, Positive
+from scenarios.schema.values import Positive
 
 
 def _fill_in(scenario: dict[Any, Any], plan: Any) -> Any:
@@ -34,10 +35,10 @@ def _fill_in(scenario: dict[Any, Any], plan: Any) -> Any:
     return filled
 
 
-class Scenario(Lean):
+class Scenario(GrownSettings):
     """A world, what changes in it, what moves in it, and the two drives."""
 
-    _LATER: ClassVar[frozenset[str]] = frozenset({"movers", "puddles", "surface", "sim"})
+    newer: ClassVar[frozenset[str]] = frozenset({"movers", "puddles", "surface", "sim"})
 
     family: str
     description: str = ""

@@ -6,17 +6,17 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from cdpipe.core.yamlfile import Settings
-from scenarios.schema.values import Lean, NotNegative
+from cdpipe.core.yamlfile import GrownSettings, Settings
+from scenarios.schema.values import NotNegative
 
 
-class Sensor(Lean):
+class Sensor(GrownSettings):
     """The LiDAR: an Ouster profile (shipped name or metadata .json), its mode, and which effects are on.
 
     Every effect is a switch, so its influence on a result can be measured. sim/sensor/SENSOR.md names the constants.
     """
 
-    _LATER: ClassVar[frozenset[str]] = frozenset({"returns", "retroreflectors", "glass"})
+    newer: ClassVar[frozenset[str]] = frozenset({"returns", "retroreflectors", "glass"})
 
     profile: str = "os1-32-nominal"
     mode: Annotated[str, Field(pattern=r"^\d+x\d+$")] = "1024x10"

@@ -6,11 +6,11 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, field_serializer, model_validator
 
-from cdpipe.core.yamlfile import Settings
+from cdpipe.core.yamlfile import GrownSettings, Settings
 from scenarios.schema.odometry import Odometry
 from scenarios.schema.platform import Platform
 from scenarios.schema.sensor import Sensor
-from scenarios.schema.values import Lean, NotNegative, Positive, SignedShare
+from scenarios.schema.values import NotNegative, Positive, SignedShare
 
 
 class Mist(Settings):
@@ -36,10 +36,10 @@ class Air(Settings):
     dust: Dust | None = None
 
 
-class SessionPlan(Lean):
+class SessionPlan(GrownSettings):
     """One drive through the tunnel: along a route, or on a recorded trajectory."""
 
-    _LATER: ClassVar[frozenset[str]] = frozenset({"air", "sensor", "platform"})
+    newer: ClassVar[frozenset[str]] = frozenset({"air", "sensor", "platform"})
 
     route: tuple[str, ...] = ()
     trajectory: str | None = None  # TUM file of world_T_sensor, instead of a route; from the scenario's file

@@ -6,8 +6,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from cdpipe.core.yamlfile import Settings
-from scenarios.schema.values import Finite, Lean, NotNegative, Positive, Reflectivity, Share, Side, SignedShare
+from cdpipe.core.yamlfile import GrownSettings, Settings
+from scenarios.schema.values import Finite, NotNegative, Positive, Reflectivity, Share, Side, SignedShare
 
 
 class Section(Settings):
@@ -120,10 +120,10 @@ class Markers(Settings):
     height_share: Share = 0.3  # of the drift's height
 
 
-class Furniture(Lean):
+class Furniture(GrownSettings):
     """What is fixed to the rock in both sessions and must never count as a change."""
 
-    _LATER: ClassVar[frozenset[str]] = frozenset({"markers"})
+    newer: ClassVar[frozenset[str]] = frozenset({"markers"})
 
     pipes: tuple[Pipe, ...] = ()
     ducts: tuple[Duct, ...] = ()

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
-
-from cdpipe.core.yamlfile import Settings
+from pydantic import Field
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -33,19 +31,3 @@ def refuse_other_keys(thing: Any, usual: Mapping[str, Mapping[str, Any]], what: 
     said = sorted(key for key in known - usual[thing.kind].keys() if getattr(thing, key) is not None)
     if said:
         raise ValueError(f"{what}: a {thing.kind} has no {', '.join(said)}: leave that out")
-
-
-class Lean(Settings):
-    """Settings that leave keys added later out of their dump while these have their defaults.
-
-    So the truth of an older scenario keeps its bytes.
-    """
-
-    _LATER: ClassVar[frozenset[str]] = frozenset()
-
-    @model_serializer(mode="wrap")
-    def _leave_out(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        fields = type(self).model_fields
-        dumped: dict[str, Any] = handler(self)
-        is_later = {key: key in self._LATER and getattr(self, key) == fields[key].default for key in dumped}
-        return {key: value for key, value in dumped.items() if not is_later[key]}
