@@ -322,7 +322,7 @@ def _open_mirror(url: str, out: Path) -> Mirror:
 
 
 def _run(plan: Plan, out: Path, where: Where, *, quiet: bool, wide: bool = False, **options: Any) -> None:
-    from eval.plans.plan import expand_cells
+    from eval.plans.cells import expand_cells
     from eval.running.runfolder import removed_if_empty, start_run_folder
     from eval.running.runner import run_plan
     from eval.running.scaling.shards import choose_cells

@@ -218,8 +218,9 @@ def check_file(name_or_path: str) -> str:
     from cdpipe.core.errors import InputError
     from cdpipe.core.yamlfile import read_yaml, suggest
     from cdpipe.model.config import PipelineConfig, load_config, preset_names
+    from eval.plans.cells import expand_cells
     from eval.plans.files import plan_names
-    from eval.plans.plan import Plan, expand_cells, load_plan
+    from eval.plans.plan import Plan, load_plan
     from scenarios import check_scenario, scenario_names
     from scenarios.schema import Scenario
 

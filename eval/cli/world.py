@@ -156,7 +156,7 @@ def survey(
     import pandas as pd
 
     from eval.core.output import make_writable
-    from eval.plans.plan import parse_seeds_option
+    from eval.plans.seeds import parse_seeds_option
     from sim.studies import survey as surveys
     from sim.studies.survey import markdown as as_markdown
     from sim.studies.survey import summary, write_csv

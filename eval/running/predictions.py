@@ -25,8 +25,8 @@ from cdpipe.model.config import preset_names
 from eval.core.output import remove
 from eval.core.progress import RunProgress, Silent
 from eval.core.tablefile import read_table
+from eval.plans.cells import list_planned_cases
 from eval.plans.coverage import read_stored_plan
-from eval.plans.plan import list_planned_cases
 from eval.running.cell_file import LAST, NO_KEY, cell_document
 from eval.running.export import copy_pair, list_pairs, list_pairs_blindly, name_blindly
 from eval.running.rescoring import foreign_identity

@@ -23,7 +23,8 @@ from eval.core.cluster import HERE, Where, connected, require_usable
 from eval.core.output import remove
 from eval.core.progress import RunProgress, Silent
 from eval.core.provenance import describe_run, digest
-from eval.plans.plan import Plan, expand_cells
+from eval.plans.cells import expand_cells
+from eval.plans.plan import Plan
 from eval.plans.variants import Cell
 from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Tools, pair_lock
 from eval.running.run_workers import remove_traces, run_on_workers

@@ -29,8 +29,8 @@ from eval.core.exits import run_program
 from eval.core.figures import picture, png
 from eval.core.output import make_writable
 from eval.core.printing import echo
+from eval.plans.cells import expand_cells
 from eval.plans.coverage import read_stored_plan
-from eval.plans.plan import expand_cells
 from eval.running.runfolder import read_json
 from eval.studies.calibrate import read_table
 from eval.tables.merge_table import RULES, is_accepted, is_right, kinds

@@ -25,8 +25,9 @@ from cdpipe.pipeline import Done
 from cdpipe.sensor.ouster import load_profile
 from eval.core.output import remove
 from eval.core.progress import Silent
+from eval.plans.cells import expand_cells
 from eval.plans.changes import change_plan
-from eval.plans.plan import Plan, expand_cells, load_plan
+from eval.plans.plan import Plan, load_plan
 from eval.running import pair_run
 from eval.running.pair_run import Tools
 from eval.running.rescoring import rescore

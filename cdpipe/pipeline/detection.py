@@ -1,88 +1,41 @@
-"""The pipeline: map, describe, merge, query, extract. This module alone defines the order of the stages.
-
-`detect` takes two sessions, `detect_changes` two mapped sessions. `Hooks` are called around every stage: the command
-line reports progress with them, a benchmark caches and times results. `regions.source` names what finds the regions
-in the merged maps.
-"""
+"""Both sessions together: merge, query, extraction and the report of changes."""
 
 from __future__ import annotations
 
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.core.errors import InputError, InputWarning, MergeFailedError
+from cdpipe.core.errors import InputWarning, MergeFailedError
 from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.core.threads import THREADS
-from cdpipe.descriptors.describe import (
-    describe_scans,
-    insert_rows,
-    list_checkpoints,
-    load_descriptors,
-    save_descriptors,
-    use_threads,
-)
-from cdpipe.descriptors.sphere import anchor_frames, describe_map
+from cdpipe.descriptors.describe import list_checkpoints, load_descriptors, use_threads
 from cdpipe.extract.extract import extract_changes, make_report
 from cdpipe.io.known_merge import require_rigid
-from cdpipe.io.readers import open_session
-from cdpipe.mapping.airborne import clear
-from cdpipe.mapping.counted import CountedScans
-from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.recorded_frames import regions_as_mapped, report_as_recorded
 from cdpipe.mapping.scanless import adapt_to_whole_maps
-from cdpipe.mapping.session_check import check_session, unit_hint
-from cdpipe.merge.candidates import first_keyframes
+from cdpipe.mapping.session_check import unit_hint
 from cdpipe.merge.coverage import measure_coverage
 from cdpipe.merge.merge import merge_maps, take_known_merge
 from cdpipe.methods.registry import list_extras, load_source
 from cdpipe.model.config import PipelineConfig, Site, load_config
 from cdpipe.model.report import ChangeRegions, ChangeReport
-from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, ScanSource, Spheres
+from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, ScanSource
+from cdpipe.pipeline.hooks import Done, Hooks
+from cdpipe.pipeline.mapping import map_pair, open_with_folder
 from cdpipe.query.drift_width import keyframe_radii
 from cdpipe.surface.measure import measure_surface, require_method
 from cdpipe.surface.rock_or_object import leave_out_rock
 
-T = TypeVar("T")
-Stage = Literal["maps", "descriptors", "spheres", "merge", "regions"]
-OnStage = Callable[[str, int, int], None]
 Merge = Callable[[MappedSession, MappedSession], MergedMaps]
 Propose = Callable[[tuple[Int64Array, Int64Array], Float64Array], ChangeRegions]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Done(Generic[T]):
-    """The result of a stage, and the wall-clock seconds of its parts by name."""
-
-    value: T
-    seconds: Mapping[str, float] = field(default_factory=dict)
-
-
-class Hooks:
-    """Hooks around the stages. Here each stage runs once; override `run` to cache results, `time` to repeat a step.
-
-    Args:
-        on_stage: Called before a stage with its name, the work done and the total work; while a session is mapped
-            also with `stage: step`, and the scans done and in all.
-    """
-
-    def __init__(self, on_stage: OnStage = lambda name, done, total: None) -> None:
-        self.on_stage = on_stage
-
-    def run(self, stage: Stage, config: PipelineConfig, compute: Callable[[], Done[T]]) -> Done[T]:
-        """Return the result of a stage that depends only on the sessions and the settings."""
-        return compute()
-
-    def time(self, compute: Callable[[], Done[T]]) -> Done[T]:
-        """Return the result of a step that is not cached."""
-        return compute()
 
 
 def detect(
@@ -135,141 +88,6 @@ def detect(
         raise MergeFailedError(f"{before.name} and {after.name}: {error}", error.evidence, error.seconds) from error
     coverage = measure_coverage(report, before.odom_T_sensor, after.odom_T_sensor)
     return replace(report, seconds={**report.seconds, **mapped.seconds}, coverage=coverage)
-
-
-def describe(
-    session: Path | str | ScanSource, preset: str = "tunnelcd", settings: Iterable[str] | Mapping[str, Any] = ()
-) -> tuple[DescriptorSet, Path]:
-    """Describe the keyframes of a session and store the vectors beside it, as a robot would while mapping.
-
-    Returns:
-        The descriptors, and the file that holds them.
-
-    Raises:
-        InputError: The session or a setting cannot be used, or the session's folder cannot be written.
-    """
-    config = load_config(preset, settings)
-    list_checkpoints(config)  # report bad weights before the mapping
-    use_threads(THREADS)
-    source, folder = _open_with_folder(session)
-    if folder is None:
-        raise InputError(f"{source.name}: descriptors are stored beside a recording: name its folder or file")
-    if config.regions.source == "sphere":
-        descriptors = map_session(source, config).descriptors
-    else:
-        chosen = choose_keyframes(source.odom_T_sensor, config.map.keyframe_spacing_m)
-        descriptors = describe_scans(clear(source, config.map), chosen, config.descriptor)
-    return descriptors, save_descriptors(folder, descriptors, source.odom_T_sensor, config.map, config.sphere)
-
-
-def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
-    """Build the thinned map of a session and describe its keyframes, as a robot does while it drives.
-
-    Raises:
-        InputError: The session or one of its scans cannot be used; the message names it and a remedy.
-    """
-    check_session(source, config.map)
-    source = clear(source, config.map)
-    thin_map = build_map(source, config.map)
-    descriptors = describe_scans(source, thin_map.keyframe_scans, config.descriptor)
-    if config.regions.source == "sphere":
-        anchors = anchor_frames(thin_map, thin_map.keyframe_scans, config.sphere)
-        spheres = describe_map(thin_map, anchors, config.descriptor, config.sphere)
-        descriptors = replace(descriptors, spheres=spheres)
-    return MappedSession(thin_map, descriptors)
-
-
-def map_pair(
-    sources: Sequence[ScanSource],
-    config: PipelineConfig,
-    hooks: Hooks,
-    stored: Sequence[DescriptorSet | None] = (None, None),
-) -> Done[tuple[MappedSession, MappedSession]]:
-    """Map both sessions and describe their keyframes.
-
-    Args:
-        sources: The before and the after session.
-        config: All settings.
-        hooks: Called around the stages.
-        stored: Stored descriptors of each session, used if they have the keyframes of its map.
-
-    Returns:
-        Both mapped sessions, and `t_descriptor_s` of all descriptors that were computed. With `merge.first_every` the
-        scans of the other keyframes are described if the merge asks for them, as a part of its time.
-
-    Raises:
-        InputError: A session or one of its scans cannot be used.
-    """
-    maps = map_sources(sources, config, hooks)
-    kept = [
-        each if each is not None and np.array_equal(each.keyframe_scans, thin_map.keyframe_scans) else None
-        for each, thin_map in zip(stored, maps, strict=True)
-    ]
-
-    every = config.described_every
-
-    def keyframes(session: int, chosen: slice) -> DescriptorSet:
-        scans = maps[session].keyframe_scans[chosen]
-        source = clear(sources[session], config.map)
-        if every == 1:
-            return describe_scans(source, scans, config.descriptor)
-        rows = first_keyframes(len(scans), every, session == 1)
-        return insert_rows(describe_scans(source, scans[rows], config.descriptor), rows, scans)
-
-    def surroundings(session: int, chosen: slice) -> Spheres:
-        anchors = anchor_frames(maps[session], maps[session].keyframe_scans[chosen], config.sphere)
-        return describe_map(maps[session], anchors, config.descriptor, config.sphere)
-
-    scans = hooks.run("descriptors", config, lambda: _describe_both("describe keyframes", keyframes, kept, hooks))
-    (before, after), seconds = scans.value, dict(scans.seconds)
-    if config.regions.source == "sphere":
-        known: list[Spheres | None] = [None if each is None else each.spheres for each in kept]
-        spheres: Done[tuple[Spheres, Spheres]] = hooks.run(
-            "spheres", config, lambda: _describe_both("describe spheres", surroundings, known, hooks)
-        )
-        before, after = (replace(a, spheres=b) for a, b in zip((before, after), spheres.value, strict=True))
-        seconds["t_descriptor_s"] += spheres.seconds["t_descriptor_s"]
-    mapped = []
-    for session, described in enumerate((before, after)):
-        rest = None
-        if every > 1 and kept[session] is None:
-            rest = partial(_describe_rest, sources[session], described, session == 1, config)
-        mapped.append(MappedSession(maps[session], described, rest))
-    return Done((mapped[0], mapped[1]), seconds)
-
-
-def _describe_rest(source: ScanSource, first: DescriptorSet, is_after: bool, config: PipelineConfig) -> DescriptorSet:
-    """Return the descriptors of all keyframes of a session of which the first ones are described."""
-    scans = first.keyframe_scans
-    rows = np.setdiff1d(np.arange(len(scans)), first_keyframes(len(scans), config.described_every, is_after))
-    if not len(rows):
-        return first
-    return insert_rows(describe_scans(clear(source, config.map), scans[rows], config.descriptor), rows, scans, first)
-
-
-def map_sources(sources: Sequence[ScanSource], config: PipelineConfig, hooks: Hooks) -> tuple[PointMap, PointMap]:
-    """Return both thinned maps, each in its session's own odom frame.
-
-    Raises:
-        InputError: A session or one of its scans cannot be used.
-    """
-
-    def compute() -> Done[tuple[PointMap, PointMap]]:
-        # check both sessions first: mapping may take minutes
-        for source, other in (sources, sources[::-1]):
-            check_session(source, config.map, other)
-        maps = []
-        for name, source in zip(("before", "after"), sources, strict=True):
-            on_step = partial(_tell_step, hooks, f"map {name}")
-            hooks.on_stage(f"map {name}", 0, 1)
-            maps.append(build_map(clear(CountedScans(source, on_step), config.map), config.map, on_step=on_step))
-        return Done((maps[0], maps[1]))
-
-    return hooks.run("maps", config, compute).value
-
-
-def _tell_step(hooks: Hooks, stage: str, step: str, done: int, total: int) -> None:
-    hooks.on_stage(f"{stage}: {step}", done, total)
 
 
 def detect_changes(
@@ -406,30 +224,10 @@ def _warn_of_few_views(mapped: Sequence[MappedSession], config: PipelineConfig) 
 
 def _open(session: Path | str | ScanSource, config: PipelineConfig) -> tuple[ScanSource, DescriptorSet | None]:
     """Return an opened session, and the descriptors stored in its folder."""
-    source, folder = _open_with_folder(session)
+    source, folder = open_with_folder(session)
     if folder is None:
         return source, None
     return source, load_descriptors(folder, config.descriptor, source.odom_T_sensor, config.map, config.sphere)
-
-
-def _open_with_folder(session: Path | str | ScanSource) -> tuple[ScanSource, Path | None]:
-    """Return an opened session, and the folder that its descriptors are stored in; None for one that is in no file."""
-    if not isinstance(session, Path | str):
-        return session, getattr(session, "descriptors_in", None)
-    source = open_session(session)
-    return source, getattr(source, "descriptors_in", None) or Path(session)
-
-
-def _describe_both(
-    name: str, describe: Callable[[int, slice], T], stored: Sequence[T | None], hooks: Hooks
-) -> Done[tuple[T, T]]:
-    """Describe the sessions, numbered 0 and 1, that have no stored descriptors; `describe` gets some keyframes."""
-    hooks.on_stage(name, 0, 1)
-    if any(each is None for each in stored):
-        describe(0, slice(1))  # loads the network
-    start = time.perf_counter()
-    before, after = (describe(k, slice(None)) if each is None else each for k, each in enumerate(stored))
-    return Done((before, after), {"t_descriptor_s": time.perf_counter() - start})
 
 
 def _sizes(merged: MergedMaps) -> dict[str, float]:
