@@ -98,7 +98,7 @@ def _compare(out: Path, name: str, committed: object, *, quiet: bool) -> None:
 
     from eval.leaderboard.comparison import compare_with_reference, list_lines, write_tables_of
     from eval.leaderboard.evaluation import describe_calls, evaluation_folder, read_evaluation
-    from eval.running.run_data import RunData, read_run
+    from eval.running.results.run_data import RunData, read_run
     from eval.running.runfolder import RunFolder
 
     run = RunFolder(out)

@@ -283,7 +283,7 @@ def report(
     if other is not None and against is not None:
         raise InputError(f"--against {against}: a second run is named too: write {folder}:{against} {other} instead")
     from eval.report.comparison import compare_sides, write_comparison
-    from eval.running.sides import read_side
+    from eval.running.results.sides import read_side
 
     first, second = (folder, other) if other is not None else (f"{folder}:{against}", folder)
     a, b = read_side(first), read_side(second)

@@ -48,23 +48,12 @@ from eval.report.site.worst import draw_worst, worst_rows
 from eval.report.summary import HEADLINES, draw_summary
 from eval.report.surface.surface import SURFACE_COLUMNS, draw_surface
 from eval.report.tables import Cell, Table, results_table, to_csv, unchanged_table
-from eval.running.run_data import (
-    RunData,
-    ends_at_merge,
-    figures_of_plan,
-    first_seed,
-    flag,
-    named_variants,
-    of,
-    plan_name,
-    read_run,
-    scenarios,
-    shown_variant,
-    text,
-)
+from eval.running.results.cases import first_seed, named_variants, scenarios
+from eval.running.results.run_data import RunData, ends_at_merge, figures_of_plan, plan_name, read_run, shown_variant
+from eval.running.results.sides import Side, check_extras, check_versions, is_contended
+from eval.running.results.values import flag, of, text
 from eval.running.runfolder import read_json
 from eval.running.scaling.remaking import remade_when_asked
-from eval.running.sides import Side, check_extras, check_versions, is_contended
 from eval.tables.columns import RESULT_COLUMNS, TIME_MEANINGS, UNDEFINED
 from eval.tables.merge_table import merge_table
 

@@ -6,17 +6,9 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 from eval.report.tables import Cell, Table
-from eval.running.run_data import (
-    Row,
-    RunData,
-    defined,
-    named_variants,
-    of,
-    over_pairs,
-    pictured_variants,
-    scenarios,
-    text,
-)
+from eval.running.results.cases import named_variants, pictured_variants, scenarios
+from eval.running.results.run_data import RunData
+from eval.running.results.values import Row, defined, of, over_pairs, text
 from eval.tables.columns import EN_DASH, THIN_SPACE, UNDEFINED, count, significant
 
 # Stathoulopoulos, Koval, Nikolakopoulos, IROS 2023, as printed; "-" alone: the paper gives no value

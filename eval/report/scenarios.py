@@ -9,7 +9,10 @@ import numpy as np
 from eval.core.charts import Axis, Drawing, Panel, Series, named_ticks
 from eval.report.drawing.charts import Chart
 from eval.report.drawing.looks import look_of
-from eval.running.run_data import RunData, interval_over_pairs, named_variants, of, over_pairs, scenarios, split_variant
+from eval.running.results.cases import named_variants, scenarios
+from eval.running.results.grids import split_variant
+from eval.running.results.run_data import RunData
+from eval.running.results.values import interval_over_pairs, of, over_pairs
 from eval.tables.columns import RESULT_COLUMNS, select
 
 _COLUMNS = select(RESULT_COLUMNS, "region_recall_at_k", "region_auroc", "object_iou_point", "object_f1_50")

@@ -14,18 +14,9 @@ import pandas as pd
 from eval.core.domains import domain_name
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.report.drawing.charts import Chart
-from eval.running.run_data import (
-    Row,
-    RunData,
-    defined,
-    flag,
-    interval_over_pairs,
-    named_variants,
-    of,
-    over_pairs,
-    scenarios,
-    text,
-)
+from eval.running.results.cases import named_variants, scenarios
+from eval.running.results.run_data import RunData
+from eval.running.results.values import Row, defined, flag, interval_over_pairs, of, over_pairs, text
 from eval.tables.columns import (
     EN_DASH,
     RESULT_COLUMNS,

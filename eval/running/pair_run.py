@@ -35,8 +35,8 @@ from eval.plans.variants import Cell
 from eval.running.cell_file import cell_document
 from eval.running.runfolder import RunFolder, write_json
 from eval.running.scaling.keeping import Keep, dropped_file, read_dropped, require_same_bytes
-from eval.running.stage_cache import open_cache
-from eval.running.stages import PairStages
+from eval.running.stages.pair_stages import PairStages
+from eval.running.stages.stage_cache import open_cache
 from eval.scoring.scoring import METRICS_VERSION, CaseScore, describe_recording, score_stored
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import GroundTruth, load_ground_truth

@@ -34,7 +34,7 @@ from eval.running.scaling.mirror import Mirror
 from eval.running.scaling.remaking import remake_pair
 from eval.running.scaling.shards import Shard, choose_cells, require_same_shard
 from eval.running.schedule import limit_pairs, schedule_pairs
-from eval.running.stages import PairStages
+from eval.running.stages.pair_stages import PairStages
 from eval.truth.ground_truth import GroundTruth
 from sim.session.truth import read_pair_truth
 

@@ -50,10 +50,10 @@ from eval.report.page import write_page
 from eval.running.cell_file import LAST, NO_KEY, cell_document
 from eval.running.export import name_blindly
 from eval.running.rescoring import foreign_identity
-from eval.running.run_data import read_run
+from eval.running.results.run_data import read_run
+from eval.running.results.sides import read_side
 from eval.running.runfolder import RunFolder, open_run_folder, write_json, write_tables
-from eval.running.sides import read_side
-from eval.running.stage_cache import Kept, StageCache
+from eval.running.stages.stage_cache import Kept, StageCache
 from eval.scoring.scoring import score_stored
 from eval.studies.calibrate import read_table
 from eval.studies.descriptors.curves import read_rows

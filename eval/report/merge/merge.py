@@ -11,7 +11,9 @@ from eval.report.merge.cases import MAX_ROWS, Case, case_table, distinct_cases, 
 from eval.report.merge.charts import error_chart, time_chart
 from eval.report.merge.tables import families_table, kinds_table, refusals_table, stated_seconds, times_table
 from eval.report.tables import Section, Table, with_rows
-from eval.running.run_data import RunData, covered_by, ends_at_merge, repeats, shown_variant, text
+from eval.running.results.cases import repeats
+from eval.running.results.run_data import RunData, covered_by, ends_at_merge, shown_variant
+from eval.running.results.values import text
 from eval.tables.merge_table import EXACT_M, RIGHT_DEG, RIGHT_M, RULES, TIMES, is_within_target, kinds, merge_table
 from eval.tables.rows import numbers
 

@@ -10,7 +10,9 @@ from cdpipe.core.errors import InputError
 from cdpipe.io.answer import read_answer
 from eval.report.objects.objects import AnsweredPair, object_title
 from eval.report.tables import Picture
-from eval.running.run_data import Row, RunData, flag, number, of, split_variant, text
+from eval.running.results.grids import split_variant
+from eval.running.results.run_data import RunData
+from eval.running.results.values import Row, flag, number, of, text
 from eval.tables.columns import count, significant
 from eval.truth.ground_truth import load_ground_truth
 

@@ -11,7 +11,9 @@ from cdpipe.io.answer import Answer
 from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.report.objects.figures import Layers, Panel, object_panels
 from eval.report.tables import Picture
-from eval.running.run_data import RunData, flag, number, of, pictured_variants, text
+from eval.running.results.cases import pictured_variants
+from eval.running.results.run_data import RunData
+from eval.running.results.values import flag, number, of, text
 from eval.scoring.answer_rows import find_answer_rows
 from eval.tables.columns import share
 from eval.truth.ground_truth import GroundTruth

@@ -16,7 +16,8 @@ from eval.plans.worlds import get_group
 from eval.report.drawing.charts import Chart
 from eval.report.drawing.looks import look_of
 from eval.report.tables import Cell, Table
-from eval.running.run_data import RunData, of, over_pairs
+from eval.running.results.run_data import RunData
+from eval.running.results.values import of, over_pairs
 from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, Column, count, select, share
 from eval.tables.effects import effects
 from eval.tables.rows import records

@@ -14,19 +14,10 @@ from eval.core.charts import COLOURS, Axis, Drawing, Look, Panel, Series, named_
 from eval.core.domains import domain_name
 from eval.report.drawing.charts import Chart
 from eval.report.settings.grids import N_ACROSS, SHARES
-from eval.running.run_data import (
-    Row,
-    RunData,
-    defined,
-    grid_points,
-    interval_over_pairs,
-    of,
-    over_pairs,
-    repeats,
-    sorted_values,
-    split_variant,
-    text,
-)
+from eval.running.results.cases import repeats
+from eval.running.results.grids import grid_points, sorted_values, split_variant
+from eval.running.results.run_data import RunData
+from eval.running.results.values import Row, defined, interval_over_pairs, of, over_pairs, text
 from eval.tables.columns import RESULT_COLUMNS
 from eval.tables.rows import with_domain
 

@@ -10,7 +10,9 @@ import numpy as np
 
 from eval.core.charts import BLACK, Axis, Drawing, Heat, Look, Panel, Series, named_ticks
 from eval.report.drawing.charts import Chart
-from eval.running.run_data import GridOf, RunData, grids, of, over_pairs
+from eval.running.results.grids import GridOf, grids
+from eval.running.results.run_data import RunData
+from eval.running.results.values import of, over_pairs
 from eval.tables.columns import RESULT_COLUMNS, Column, share
 
 _GRID_KEYS = (

@@ -10,7 +10,9 @@ from cdpipe.core.errors import InputError
 from cdpipe.io.answer import read_answer
 from eval.report.site.site import region_picture
 from eval.report.tables import Picture
-from eval.running.run_data import Row, RunData, number, of, rows_of_case, scenarios, text
+from eval.running.results.cases import rows_of_case, scenarios
+from eval.running.results.run_data import RunData
+from eval.running.results.values import Row, number, of, text
 from eval.tables.columns import share
 from eval.truth.ground_truth import load_ground_truth
 

@@ -13,7 +13,8 @@ from eval.core.charts import BLUE, ORANGE
 from eval.report.maps import RED, RegionMark, TruthMark, distance_map, joined_labels, overlay_map, region_map
 from eval.report.objects.figures import Panel, object_panels, oblique_view
 from eval.report.tables import beside, best
-from eval.running.run_data import RunData, grids, off_grids, split_variant
+from eval.running.results.grids import grids, off_grids, split_variant
+from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
 from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, count, significant
 

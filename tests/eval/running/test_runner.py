@@ -33,7 +33,7 @@ from eval.running.pair_run import Tools
 from eval.running.rescoring import rescore
 from eval.running.runfolder import RunFolder, open_run_folder, start_run_folder, write_json, write_tables
 from eval.running.runner import RunOutcome, _provenance, run_plan
-from eval.running.stages import time_parts
+from eval.running.stages.pair_stages import time_parts
 from eval.truth.adapters import pipeline_input
 from scenarios.library import load_scenario
 from scenarios.references import file_digests

@@ -11,7 +11,8 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import suggest
-from eval.running.run_data import Row, RunData, covered_by, flag, read_run
+from eval.running.results.run_data import RunData, covered_by, read_run
+from eval.running.results.values import Row, flag
 from eval.scoring.scoring import METRICS_VERSION
 from eval.tables.rows import PAIR
 

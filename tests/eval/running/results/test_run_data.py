@@ -7,7 +7,7 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from eval.report.page import write_page
-from eval.running.run_data import read_run
+from eval.running.results.run_data import read_run
 from eval.scoring.scoring import METRICS_VERSION
 
 IDENTITY = {"scenario": "regions/narrow", "variant": "tunnelcd"}

@@ -1,7 +1,7 @@
 """Names and arrays of stage results; arrays survive the disk bit by bit.
 
 A name holds the digest of the settings that the stage reads, of the weights, and of the names of the results that it
-reads. The sessions and the code, which all stages read, are in the folder's name (eval/running/stage_cache.py).
+reads. The sessions and the code, which all stages read, are in the folder's name (stage_cache.py).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cdpipe.model.report import ChangeRegions, Clusters
 from cdpipe.model.types import DescriptorSet, KeyframeViews, MergedMaps, PointMap
 from cdpipe.pipeline import Stage
 from eval.core.provenance import digest
-from eval.running.stage_cache import Arrays
+from eval.running.stages.stage_cache import Arrays
 from eval.truth.ground_truth import SESSIONS
 
 _PIXELS = tuple(f"{session}.return_pixels" for session in SESSIONS)

@@ -1,6 +1,6 @@
 """The pipeline on one pair: each stage runs once for all variants that share its inputs, and is timed.
 
-A result is found again by its inputs (eval/running/stage_cache.py), also by a later process: another voxel of the
+A result is found again by its inputs (stage_cache.py), also by a later process: another voxel of the
 extraction runs the extraction alone, another radius the query and the extraction. A result that is found again keeps
 the seconds that it took when it ran.
 
@@ -37,8 +37,8 @@ from cdpipe.pipeline import (
     map_sources,
 )
 from eval.plans.variants import Until
-from eval.running.stage_cache import Kept, StageCache
-from eval.running.stage_results import is_kept, name_result, pack, unpack
+from eval.running.stages.stage_cache import Kept, StageCache
+from eval.running.stages.stage_results import is_kept, name_result, pack, unpack
 
 REPEAT_BELOW_S = 1.0
 REPEATS = 3

@@ -2,7 +2,7 @@
 
 RUN/stages/<world>/<seed>/<root>/<stage>-<digest>.npz holds the arrays and the seconds of one stage. The root is the
 digest of both sessions' files and of the pipeline's code, the name that of everything that the stage reads
-(eval/running/stage_results.py): a result that is found equals the one that would be computed. A file appears whole or
+(stage_results.py): a result that is found equals the one that would be computed. A file appears whole or
 not at all; a damaged one is ignored.
 """
 
@@ -29,7 +29,7 @@ from eval.core.provenance import digest
 MAPS = "maps"
 # Maps are large: at most this much of them is stored in a run folder.
 MAPS_BYTES = 4 << 30
-_FORMAT = 1  # rises when eval/running/stage_results.py makes something else of the same result
+_FORMAT = 1  # rises when stage_results.py makes something else of the same result
 _SECONDS, _IS_CONTENDED, _N_ARRAYS = "seconds.", "is_contended", "n_arrays"
 # Deflating noise takes as long as computing it, and saves nothing.
 _NOISE = ".return_offsets"

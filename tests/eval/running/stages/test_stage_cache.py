@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from torch import nn
 
-from cdpipe import pipeline
 from cdpipe.core.errors import MergeFailedError
 from cdpipe.descriptors.change_network import make_untrained_change_network
 from cdpipe.descriptors.network import make_untrained_network
@@ -24,15 +23,15 @@ from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import PipelineConfig, RegionsConfig, load_config
 from cdpipe.model.report import ChangeRegions
 from cdpipe.model.types import DescriptorSet, KeyframeViews, MergedMaps, PointMap
-from cdpipe.pipeline import Stage
+from cdpipe.pipeline import Hooks, Stage, detect_changes, detection, map_pair, mapping
 from eval.plans.plan import load_plan
-from eval.running import stage_cache, stage_results, stages
 from eval.running.pair_run import Tools
 from eval.running.runfolder import RunFolder, start_run_folder
 from eval.running.runner import run_plan
-from eval.running.stage_cache import Kept, StageCache, open_cache
-from eval.running.stage_results import is_kept, name_result, pack, unpack
-from eval.running.stages import PairStages
+from eval.running.stages import pair_stages, stage_cache, stage_results
+from eval.running.stages.pair_stages import PairStages
+from eval.running.stages.stage_cache import Kept, StageCache, open_cache
+from eval.running.stages.stage_results import is_kept, name_result, pack, unpack
 from eval.truth.adapters import pipeline_input
 from scenarios.library import load_scenario
 from scenarios.schema import Scenario
@@ -91,8 +90,9 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
         return call
 
+    places = {"find_regions": descriptor, "merge_maps": detection}
     for name in STAGES:
-        where = descriptor if name == "find_regions" else pipeline
+        where = places.get(name, mapping)
         monkeypatch.setattr(where, name, counting(where, name))
     return counted
 
@@ -126,7 +126,7 @@ def test_the_query_and_the_extraction_apart_are_the_comparison_of_the_pipeline(p
     config = config_of("tunnelcd")
     here = stages_of(pair)
     sources = [pipeline_input(pair, name) for name in ("before", "after")]
-    whole = pipeline.detect_changes(*pipeline.map_pair(sources, config, pipeline.Hooks()).value, config)
+    whole = detect_changes(*map_pair(sources, config, Hooks()).value, config)
     parts = here.answer(config)
     assert_same(whole.regions, parts.regions)
     assert_same(whole.objects, parts.objects)
@@ -234,7 +234,7 @@ def test_workers_call_every_stage_once(pair: Path, calls: Counter[str]) -> None:
     alone = stages_of(pair, is_shared=False)
     for voxel_m in (0.3, 0.4, 0.5):
         alone.answer(config_of("tunnelcd voxel", f"extract.voxel_m={voxel_m}"))
-    assert {calls["merge_maps"], calls["find_regions"]} <= {1, 1 + stages.REPEATS}
+    assert {calls["merge_maps"], calls["find_regions"]} <= {1, 1 + pair_stages.REPEATS}
     assert calls["find_regions"] > 0
 
 
