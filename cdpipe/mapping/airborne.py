@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.geometry import BoolArray, Float64Array, transform
-from cdpipe.core.voxel import cell_keys
+from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PointMap, PosedScan, ScanSource, WrappedScans
 

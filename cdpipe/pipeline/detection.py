@@ -19,7 +19,7 @@ from cdpipe.core.threads import THREADS
 from cdpipe.descriptors.describe import list_checkpoints, load_descriptors, use_threads
 from cdpipe.extract.extract import extract_changes, make_report
 from cdpipe.io.known_merge import require_rigid
-from cdpipe.mapping.recorded_frames import regions_as_mapped, report_as_recorded
+from cdpipe.mapping.poses.recorded_frames import regions_as_mapped, report_as_recorded
 from cdpipe.mapping.scanless import adapt_to_whole_maps
 from cdpipe.mapping.session_check import unit_hint
 from cdpipe.merge.coverage import measure_coverage

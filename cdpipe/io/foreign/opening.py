@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
-from cdpipe.core.motion import Motion
+from cdpipe.core.geometry.motion import Motion
 from cdpipe.core.plugins import require_extra
 from cdpipe.io.foreign.clouds import Clouds, point_times
 from cdpipe.io.foreign.folders import E57Scans, open_folder
@@ -28,8 +28,8 @@ from cdpipe.io.foreign.trajectory import Trajectory, poses_at, read_poses, requi
 from cdpipe.io.foreign.whole_map import MapStations
 from cdpipe.io.ply import write_ply_points
 from cdpipe.io.tum import write_tum
-from cdpipe.mapping.odometry import ODOMETRIES, estimate_cloud_motion
-from cdpipe.mapping.pose_check import check_quaternion_order
+from cdpipe.mapping.poses.odometry import ODOMETRIES, estimate_cloud_motion
+from cdpipe.mapping.poses.pose_check import check_quaternion_order
 from cdpipe.model.types import PosedScan
 
 KISS_ICP = "kiss-icp"

@@ -23,14 +23,14 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, make_pose, require_poses
-from cdpipe.core.motion import Motion, make_motion
+from cdpipe.core.geometry.motion import Motion, make_motion
 from cdpipe.core.plugins import require_extra
 from cdpipe.io.foreign.trajectory import read_poses
 from cdpipe.io.ouster.beams import check_beams
 from cdpipe.io.ouster.captures import Progress, Recording, Revolution, open_recording
 from cdpipe.io.session import ScanChunk, SessionWriter, fit_chunk
 from cdpipe.io.tum import motion_along
-from cdpipe.mapping.odometry import ODOMETRIES, estimate_motion
+from cdpipe.mapping.poses.odometry import ODOMETRIES, estimate_motion
 
 KISS_ICP = "kiss-icp"
 _OWN_POSE_TOLERANCE = 1e-9

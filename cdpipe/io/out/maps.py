@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.geometry import BoolArray, Float64Array, transform
-from cdpipe.core.voxel import UniqueCells, cell_keys
+from cdpipe.core.geometry.voxel import UniqueCells, cell_keys
 from cdpipe.io.out.scans import Outgoing, OutScan, Progress
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, transform, travelled_m
-from cdpipe.core.voxel import thin
+from cdpipe.core.geometry.voxel import thin
 from cdpipe.io.answer import Answer, read_answer
 from cdpipe.io.out.answer_map import require_own_keyframes
 from cdpipe.io.readers import open_session

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.core.path_frames import FRAMES
+from cdpipe.core.geometry.path_frames import FRAMES
 from cdpipe.core.plugins import extra_version
 from cdpipe.descriptors import checkpoint_digest, range_net_digest, sphere_digest
 from cdpipe.methods.registry import PACKAGES

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream
-from cdpipe.mapping import consistency
-from cdpipe.mapping.consistency import make_consistent
 from cdpipe.mapping.mapping import build_map
-from cdpipe.mapping.scan_registration import spread
+from cdpipe.mapping.poses import consistency
+from cdpipe.mapping.poses.consistency import make_consistent
+from cdpipe.mapping.poses.scan_registration import spread
 from cdpipe.model.config import MapConfig, load_config
 from tests.cdpipe.conftest import CloudScans, scanned
 

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, invert, travelled_m
+from cdpipe.core.geometry.motion import Motion, make_motion, rotation_matrices
 from cdpipe.core.isolation import run_isolated
-from cdpipe.core.motion import Motion, make_motion, rotation_matrices
 from cdpipe.sensor.ouster import SensorMetadata
 
 # Smaller than KISS-ICP's defaults, which are for streets: a drift is 4 to 9 m wide.
@@ -118,7 +118,7 @@ def _register(frames: Iterable[_Frame], stamps_s: Float64Array, what: str, odome
     """Return the pose (S, 4, 4) of each frame."""
     if odometry != _GENZ:
         return register_frames(_kiss_icp(), "KISS-ICP", frames, stamps_s, what)
-    from cdpipe.mapping.genz import register_stored, stored_scan
+    from cdpipe.mapping.poses.genz import register_stored, stored_scan
 
     with TemporaryDirectory(prefix="tunnelcd-") as folder:
         for number, frame in enumerate(frames):

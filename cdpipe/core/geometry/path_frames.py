@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cdpipe.core.geometry import Float64Array, Int64Array, make_pose, require_poses
+from cdpipe.core.geometry.arrays import Float64Array, Int64Array
+from cdpipe.core.geometry.poses import make_pose, require_poses
 
 # Name of these frames in what is stored of them: descriptors and training data of other frames are not the same.
 FRAMES = "path and gravity 1"

@@ -17,7 +17,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, make_pose, transform
-from cdpipe.mapping.scan_registration import MIN_PAIRS, Registration, Samples, Target, register_scan, spread
+from cdpipe.mapping.poses.scan_registration import MIN_PAIRS, Registration, Samples, Target, register_scan, spread
 
 # Places are this far apart along the path; those closer than the second are no two passes.
 _SPACING_M, _APART_M = 4.0, 25.0

@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
-from cdpipe.mapping.consistency import make_consistent
-from cdpipe.mapping.loops import Loop, close_loops, find_loops
-from cdpipe.mapping.scan_registration import Samples
+from cdpipe.mapping.poses.consistency import make_consistent
+from cdpipe.mapping.poses.loops import Loop, close_loops, find_loops
+from cdpipe.mapping.poses.scan_registration import Samples
 from tests.cdpipe.conftest import CloudScans
 
 RADIUS_M, HALF_M = 14.0, 2.2

@@ -33,7 +33,7 @@ def register_stored(document: dict[str, Any]) -> list[Any]:
     Raises:
         InputError: A pose is not finite.
     """
-    from cdpipe.mapping.odometry import cloud_frame, register_frames
+    from cdpipe.mapping.poses.odometry import cloud_frame, register_frames
 
     _keep_to_one_core()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
+from cdpipe.core.geometry.arrays import Float32Array, Float64Array, Int64Array
 
 _BITS = 21
 _HALF = 1 << (_BITS - 1)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cdpipe.core.voxel import UniqueCells, cell_corners, cell_keys, max_coordinate_m, thin
+from cdpipe.core.geometry.voxel import UniqueCells, cell_corners, cell_keys, max_coordinate_m, thin
 
 
 def test_keys_by_hand() -> None:

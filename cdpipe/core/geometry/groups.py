@@ -7,7 +7,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.core.geometry.arrays import Float64Array, Int64Array
 
 
 def label_groups(points: Float64Array, link_m: float) -> tuple[Int64Array, Int64Array]:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import Float64Array, make_pose
+from cdpipe.core.geometry.arrays import Float64Array
+from cdpipe.core.geometry.poses import make_pose
 
 # Below this angle Slerp equals linear interpolation of the quaternions to the last bit.
 _STRAIGHT_RAD = 1e-6

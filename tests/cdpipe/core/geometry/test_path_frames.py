@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, make_pose
-from cdpipe.core.path_frames import path_frames
+from cdpipe.core.geometry.path_frames import path_frames
 
 
 def poses_at(positions: Float64Array, seed: int | None = None) -> Float64Array:

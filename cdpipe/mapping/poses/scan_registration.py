@@ -10,8 +10,8 @@ import small_gicp
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, make_pose, plane_jacobian, transform, travelled_m
+from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.core.spooled import SpooledArray
-from cdpipe.core.voxel import cell_keys
 from cdpipe.model.types import ScanSource
 
 # Points nearer than this are used: farther ones carry more of the rotation's error than of the walls.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, require_shape
+from cdpipe.core.geometry.arrays import BoolArray, Float64Array, Int64Array, require_shape
 
 _COLUMN_M = 2.0
 _SHIFT = 31

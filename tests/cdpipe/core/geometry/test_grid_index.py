@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import transform, yaw_pose
-from cdpipe.core.grid_index import GridIndex
+from cdpipe.core.geometry.grid_index import GridIndex
 from cdpipe.model.types import MappedSession
 
 

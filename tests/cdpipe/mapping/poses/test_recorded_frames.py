@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, travelled_m
-from cdpipe.mapping.recorded_frames import merge_as_mapped, regions_as_mapped, report_as_recorded
+from cdpipe.mapping.poses.recorded_frames import merge_as_mapped, regions_as_mapped, report_as_recorded
 from cdpipe.merge.merge import take_known_merge
 from cdpipe.model.config import ExtractConfig, MergeConfig, PipelineConfig, QueryConfig
 from cdpipe.model.report import ChangeReport

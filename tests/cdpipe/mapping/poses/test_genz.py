@@ -10,7 +10,7 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import stream
 from cdpipe.io.foreign.opening import HowToRead, open_recording
-from cdpipe.mapping.odometry import estimate_cloud_motion
+from cdpipe.mapping.poses.odometry import estimate_cloud_motion
 
 STEP_M = np.array([0.2, 0.05, 0.0])
 N_SCANS = 6

@@ -9,8 +9,8 @@ the walls do not.
 2. Sweeps register every scan with those on both sides (`_sweep`): first each with every second scan alone, never
    with itself, as a scan that is off would find itself; then with all, which ties even and odd scans together.
 3. A scan that no pose lays on the walls is bent: the sensor was shaken within the revolution. Its points are left out.
-4. Where the session comes through a place that it knows, the loop is closed (`cdpipe.mapping.loops`), and the scans of
-   both passes are registered with one another.
+4. Where the session comes through a place that it knows, the loop is closed (`loops.py`), and the scans of both
+   passes are registered with one another.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert
 from cdpipe.mapping.counted import OnStep
-from cdpipe.mapping.loops import Loop, close_loops, find_loops
-from cdpipe.mapping.scan_registration import Registration, Samples, Target, register_scan
+from cdpipe.mapping.poses.loops import Loop, close_loops, find_loops
+from cdpipe.mapping.poses.scan_registration import Registration, Samples, Target, register_scan
 from cdpipe.model.types import PosedScan, ScanSource, WrappedScans
 
 # A block of path is registered with one map: its scans, and those within this way before and after it.
