@@ -1,12 +1,11 @@
 from .detection import Merge, Propose, detect, detect_changes, detect_merge, merge_mapped
-from .hooks import Done, Hooks, OnStage, Stage, T
+from .hooks import Done, Hooks, Stage, T
 from .mapping import describe, map_pair, map_session, map_sources
 
 __all__ = [
     "Done",
     "Hooks",
     "Merge",
-    "OnStage",
     "Propose",
     "Stage",
     "T",

@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Generic, Literal, TypeVar
 
+from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.model.config import PipelineConfig
 
 T = TypeVar("T")
 Stage = Literal["maps", "descriptors", "spheres", "merge", "regions"]
-OnStage = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,7 +29,7 @@ class Hooks:
             also with `stage: step`, and the scans done and in all.
     """
 
-    def __init__(self, on_stage: OnStage = lambda name, done, total: None) -> None:
+    def __init__(self, on_stage: Progress = report_nothing) -> None:
         self.on_stage = on_stage
 
     def run(self, stage: Stage, config: PipelineConfig, compute: Callable[[], Done[T]]) -> Done[T]:

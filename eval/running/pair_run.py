@@ -18,12 +18,12 @@ import numpy as np
 
 from cdpipe.core.errors import InputError, MergeFailedError, ScenarioError, TunnelcdError
 from cdpipe.core.plugins import extra_version
+from cdpipe.core.progress import Progress
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import checkpoint_digest, list_checkpoints, use_threads
 from cdpipe.io.answer import write_answer, write_failure
 from cdpipe.methods.registry import PACKAGES, list_extras
 from cdpipe.model.config import WEIGHTS, MapConfig
-from cdpipe.pipeline import OnStage
 from eval.core.domains import domain_of
 from eval.core.output import remove, whole_file
 from eval.core.progress import RunProgress
@@ -102,7 +102,7 @@ class Tools:
     """
 
     draw: Callable[[str, int, tuple[str, ...]], Scenario] = load_scenario
-    simulate: Callable[[Scenario, int, Path, OnStage], None] = make_pair
+    simulate: Callable[[Scenario, int, Path, Progress], None] = make_pair
     commit: Callable[[], str | None] = git_commit
     now: Callable[[], str] = now
 

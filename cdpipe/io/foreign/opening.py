@@ -6,7 +6,7 @@ import hashlib
 import shutil
 import tempfile
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,6 +19,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.core.geometry.motion import Motion
 from cdpipe.core.plugins import require_extra
+from cdpipe.core.progress import Progress
 from cdpipe.io.foreign.clouds import Clouds, point_times
 from cdpipe.io.foreign.folders import E57Scans, open_folder
 from cdpipe.io.foreign.points_files import cloud_reader
@@ -34,7 +35,6 @@ from cdpipe.model.types import PosedScan
 
 KISS_ICP = "kiss-icp"
 # Called with the stage, the number of finished scans, and their (estimated) total.
-Progress = Callable[[str, int, int], None]
 _NOMINAL_S = 0.1  # between scans that have no times
 
 

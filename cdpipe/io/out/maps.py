@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from cdpipe.core.geometry import BoolArray, Float64Array, transform
 from cdpipe.core.geometry.voxel import UniqueCells, cell_keys
-from cdpipe.io.out.scans import Outgoing, OutScan, Progress
+from cdpipe.core.progress import Progress
+from cdpipe.io.out.scans import Outgoing, OutScan
 
 
 @dataclass(frozen=True, slots=True, eq=False)

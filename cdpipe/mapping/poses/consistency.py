@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert
-from cdpipe.mapping.counted import OnStep
+from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.mapping.poses.loops import Loop, close_loops, find_loops
 from cdpipe.mapping.poses.scan_registration import Registration, Samples, Target, register_scan
 from cdpipe.model.types import PosedScan, ScanSource, WrappedScans
@@ -73,7 +73,7 @@ class ConsistentScans(WrappedScans):
 
 
 def make_consistent(
-    source: ScanSource, *, has_loops: bool = False, on_step: OnStep = lambda step, done, total: None
+    source: ScanSource, *, has_loops: bool = False, on_step: Progress = report_nothing
 ) -> ConsistentScans:
     """Return a session with poses under which its scans agree with one another; the recorded ones where they do so.
 
@@ -120,7 +120,7 @@ def _agree(scans: Samples, poses: Float64Array, told: _Told) -> bool:
 class _Told:
     """Tells how many scans each registration of all scans has done."""
 
-    def __init__(self, on_step: OnStep, total: int) -> None:
+    def __init__(self, on_step: Progress, total: int) -> None:
         self._on_step, self._total = on_step, total
         self._number = self._done = 0
 

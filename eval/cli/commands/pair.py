@@ -3,12 +3,13 @@
 # ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cdpipe.core.progress import Progress
 from eval.cli.inputs import (
     RECORDING,
     Deskew,
@@ -127,7 +128,7 @@ def _write_page(
     method: str,
     report: ChangeReport,
     file: Path,
-    on_stage: Callable[[str, int, int], None],
+    on_stage: Progress,
 ) -> None:
     from eval.report.answer.content import gather_content
     from eval.report.answer.page import write_answer_page

@@ -19,23 +19,12 @@ from typing import Any
 
 import numpy as np
 
+from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.methods.registry import load_source
 from cdpipe.model.config import MapConfig, PipelineConfig
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import MappedSession, PointMap, ScanSource
-from cdpipe.pipeline import (
-    Done,
-    Hooks,
-    Merge,
-    OnStage,
-    Propose,
-    Stage,
-    T,
-    detect_changes,
-    detect_merge,
-    map_pair,
-    map_sources,
-)
+from cdpipe.pipeline import Done, Hooks, Merge, Propose, Stage, T, detect_changes, detect_merge, map_pair, map_sources
 from eval.plans.variants import Until
 from eval.running.stages.stage_cache import Kept, StageCache
 from eval.running.stages.stage_results import is_kept, name_result, pack, unpack
@@ -69,7 +58,7 @@ class PairStages(Hooks):
         self,
         before: ScanSource,
         after: ScanSource,
-        on_stage: OnStage = lambda name, done, total: None,
+        on_stage: Progress = report_nothing,
         cache: StageCache | None = None,
         *,
         is_shared: bool = False,
