@@ -16,7 +16,7 @@ from cdpipe.core.threads import THREADS
 from cdpipe.descriptors.describe import describe_scans, insert_rows, list_checkpoints, save_descriptors, use_threads
 from cdpipe.descriptors.sphere import anchor_frames, describe_map
 from cdpipe.io.readers import open_session
-from cdpipe.mapping.airborne import clear
+from cdpipe.mapping.airborne import clear_air
 from cdpipe.mapping.counted import CountedScans
 from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.session_check import check_session
@@ -47,7 +47,7 @@ def describe(
         descriptors = map_session(source, config).descriptors
     else:
         chosen = choose_keyframes(source.odom_T_sensor, config.map.keyframe_spacing_m)
-        descriptors = describe_scans(clear(source, config.map), chosen, config.descriptor)
+        descriptors = describe_scans(clear_air(source, config.map), chosen, config.descriptor)
     return descriptors, save_descriptors(folder, descriptors, source.odom_T_sensor, config.map, config.sphere)
 
 
@@ -58,7 +58,7 @@ def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
         InputError: The session or one of its scans cannot be used; the message names it and a remedy.
     """
     check_session(source, config.map)
-    source = clear(source, config.map)
+    source = clear_air(source, config.map)
     thin_map = build_map(source, config.map)
     descriptors = describe_scans(source, thin_map.keyframe_scans, config.descriptor)
     if config.regions.source == "sphere":
@@ -99,7 +99,7 @@ def map_pair(
 
     def keyframes(session: int, chosen: slice) -> DescriptorSet:
         scans = maps[session].keyframe_scans[chosen]
-        source = clear(sources[session], config.map)
+        source = clear_air(sources[session], config.map)
         if every == 1:
             return describe_scans(source, scans, config.descriptor)
         rows = first_keyframes(len(scans), every, session == 1)
@@ -133,7 +133,9 @@ def _describe_rest(source: ScanSource, first: DescriptorSet, is_after: bool, con
     rows = np.setdiff1d(np.arange(len(scans)), first_keyframes(len(scans), config.described_every, is_after))
     if not len(rows):
         return first
-    return insert_rows(describe_scans(clear(source, config.map), scans[rows], config.descriptor), rows, scans, first)
+    return insert_rows(
+        describe_scans(clear_air(source, config.map), scans[rows], config.descriptor), rows, scans, first
+    )
 
 
 def map_sources(sources: Sequence[ScanSource], config: PipelineConfig, hooks: Hooks) -> tuple[PointMap, PointMap]:
@@ -151,7 +153,7 @@ def map_sources(sources: Sequence[ScanSource], config: PipelineConfig, hooks: Ho
         for name, source in zip(("before", "after"), sources, strict=True):
             on_step = partial(_tell_step, hooks, f"map {name}")
             hooks.on_stage(f"map {name}", 0, 1)
-            maps.append(build_map(clear(CountedScans(source, on_step), config.map), config.map, on_step=on_step))
+            maps.append(build_map(clear_air(CountedScans(source, on_step), config.map), config.map, on_step=on_step))
         return Done((maps[0], maps[1]))
 
     return hooks.run("maps", config, compute).value

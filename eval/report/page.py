@@ -51,7 +51,7 @@ from eval.report.tables import Cell, Table, results_table, to_csv, unchanged_tab
 from eval.running.results.cases import first_seed, named_variants, scenarios
 from eval.running.results.run_data import RunData, ends_at_merge, figures_of_plan, plan_name, read_run, shown_variant
 from eval.running.results.sides import Side, check_extras, check_versions, is_contended
-from eval.running.results.values import flag, of, text
+from eval.running.results.values import flag, select_rows, text
 from eval.running.runfolder import read_json
 from eval.running.scaling.remaking import remade_when_asked
 from eval.tables.columns import RESULT_COLUMNS, TIME_MEANINGS, UNDEFINED
@@ -289,7 +289,7 @@ def tabulate_settings(data: RunData) -> Table:
     for scenario in [*scenarios(data, unchanged=False), *scenarios(data, unchanged=True)]:
         seed = first_seed(data, scenario)
         for name in named_variants(data, scenario):
-            if of(data.results, scenario=scenario, seed=seed, variant=name):
+            if select_rows(data.results, scenario=scenario, seed=seed, variant=name):
                 document = read_json(data.folder.answer(scenario, seed, name) / "answer.json")
                 config = document.get("config")
                 found.setdefault(name, []).append(_flat(config) if isinstance(config, Mapping) else {})

@@ -19,11 +19,12 @@ from cdpipe.model.types import PointMap
 
 
 def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) -> ChangeReport:
-    """Return a report on two maps in the frames of the recorded odometries; itself where both maps have those.
+    """Return a report with its places in the frames of the recorded odometries.
 
-    An object moves as a whole, by the motion of its middle, and keeps its size and its upright axis. The alignment at
-    an after keyframe is the one that moves what the sensor saw there to the same place as before; `before_T_after` is
-    as found, as the frames differ from place to place.
+    The report is returned unchanged where both maps have these frames. An object moves as a whole, by the motion of its
+    middle, and keeps its size and its upright axis. The alignment at an after keyframe takes what the sensor saw there
+    to the place where it was found. `before_T_after` stays as it was found, because the frames differ from place to
+    place.
 
     Args:
         report: In the frames of the maps.
@@ -58,9 +59,10 @@ def regions_as_mapped(regions: ChangeRegions, before: PointMap) -> ChangeRegions
 
 
 def merge_as_mapped(before_T_after: Float64Array, before: PointMap, after: PointMap) -> PathAlignment:
-    """Return the alignment of two maps that moves what an after keyframe saw as a (4, 4) merge of recorded frames does.
+    """Return a (4, 4) merge of the recorded frames as an alignment of two maps with consistent poses.
 
-    It is the merge itself where neither map has other poses than those that were recorded.
+    What an after keyframe saw lands where the merge puts it. The alignment is the merge itself where both maps have the
+    recorded poses.
     """
     if all(np.array_equal(_recorded_T_keyframe(each), each.odom_T_keyframe) for each in (before, after)):
         return PathAlignment.rigid(before_T_after)

@@ -7,7 +7,7 @@ import pandas as pd
 from eval.plans.worlds import find_references, is_other_odometry
 from eval.running.results.grids import grid_points
 from eval.running.results.run_data import RunData
-from eval.running.results.values import Row, flag, of
+from eval.running.results.values import Row, flag, select_rows
 from eval.tables.rows import with_domain
 
 _PICTURED = ("paper", "tunnelcd", "voxel-diff")
@@ -23,7 +23,7 @@ def comparable(data: RunData) -> pd.DataFrame:
 def rows_of_case(data: RunData, scenario: str, seed: int, variant: str) -> dict[str, list[Row]]:
     """Return the rows of the tables `changes` and `regions` that are about one answer."""
     wanted = {"scenario": scenario, "seed": seed, "variant": variant}
-    return {"changes": of(data.changes, **wanted), "regions": of(data.regions, **wanted)}
+    return {"changes": select_rows(data.changes, **wanted), "regions": select_rows(data.regions, **wanted)}
 
 
 def scenarios(data: RunData, *, unchanged: bool) -> list[str]:
@@ -31,12 +31,12 @@ def scenarios(data: RunData, *, unchanged: bool) -> list[str]:
 
     Scenarios that only repeat another world under a setting are left out; `eval.report.settings.effects` shows them.
     """
-    held = repeats(data)
+    held = find_repeats(data)
     names = dict.fromkeys(world for world, variant, _ in data.cases if (world, variant) not in held)
     return [name for name in names if is_unchanged(data, name) == unchanged]
 
 
-def repeats(data: RunData) -> dict[tuple[str, str], str]:
+def find_repeats(data: RunData) -> dict[tuple[str, str], str]:
     """Return the reference world of each (world, variant) that is another with a setting (`eval.plans.worlds`)."""
     found = find_references(data.cases)
     return {case: other for case, other in found.items() if not is_other_odometry(case[0], other)}
@@ -44,14 +44,14 @@ def repeats(data: RunData) -> dict[tuple[str, str], str]:
 
 def is_unchanged(data: RunData, scenario: str) -> bool:
     """Tell whether every pair of a scenario is unchanged, by its rows."""
-    flags = [flag(row, "is_unchanged_pair") for row in of(data.results, scenario=scenario)]
+    flags = [flag(row, "is_unchanged_pair") for row in select_rows(data.results, scenario=scenario)]
     known = [value for value in flags if value is not None]
     return bool(known) and all(known)
 
 
 def named_variants(data: RunData, scenario: str) -> list[str]:
     """Return the variants of a scenario that are neither grid point nor repetition, in the order of results.csv."""
-    held = repeats(data)
+    held = find_repeats(data)
     names = dict.fromkeys(name for world, name, _ in data.cases if world == scenario and (world, name) not in held)
     points = grid_points(data)
     return [name for name in names if (scenario, name) not in points]
@@ -65,5 +65,5 @@ def pictured_variants(data: RunData, scenario: str) -> list[str]:
 
 def first_seed(data: RunData, scenario: str) -> int:
     """Return the first seed of a scenario that is no repetition; the pictures show it."""
-    held = repeats(data)
+    held = find_repeats(data)
     return min(seed for world, name, seed in data.cases if world == scenario and (world, name) not in held)

@@ -29,7 +29,7 @@ class GridOf:
     points: Mapping[tuple[str, str], str]
 
 
-def grids(data: RunData) -> list[GridOf]:
+def find_grids(data: RunData) -> list[GridOf]:
     """Find the grids: variants of one preset that set the same keys, two of them to several values, the rest to one."""
     found: dict[tuple[str, str, tuple[str, ...]], dict[str, dict[str, str]]] = {}
     for row in data.results:
@@ -51,7 +51,7 @@ def grids(data: RunData) -> list[GridOf]:
 
 def grid_points(data: RunData) -> set[tuple[str, str]]:
     """Return the scenario and the variant of every point of a grid."""
-    return {(grid.scenario, name) for grid in grids(data) for name in grid.points.values()}
+    return {(grid.scenario, name) for grid in find_grids(data) for name in grid.points.values()}
 
 
 def off_grids(table: pd.DataFrame, data: RunData) -> pd.DataFrame:
