@@ -56,7 +56,7 @@ class Recording(Settings):
 class GraftScenario(Scenario):
     """A scenario without a tunnel and drives of its own: those keys hold placeholders and are never dumped."""
 
-    _LATER: ClassVar[frozenset[str]] = Scenario._LATER | {"tunnel", "before", "after", "areas", "sensor", "platform"}
+    newer: ClassVar[frozenset[str]] = Scenario.newer | {"tunnel", "before", "after", "areas", "sensor", "platform"}
 
     tunnel: Tunnel = Tunnel(mesh=MeshFile(path=_NO_FILE))
     before: SessionPlan = SessionPlan(trajectory=_NO_FILE)

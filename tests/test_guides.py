@@ -12,10 +12,11 @@ import typer.main
 
 from cdpipe.descriptors import handmade
 from cdpipe.sensor.ouster import load_profile
+from eval.cli.commands.tools import check_file
 from eval.cli.main import app
-from eval.cli.tools import check_file
+from eval.plans.cells import expand_cells
 from eval.plans.files import plan_names
-from eval.plans.plan import expand_cells, load_plan
+from eval.plans.plan import load_plan
 from eval.release.content import load_release
 from scenarios.library import load_scenario
 

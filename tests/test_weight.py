@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from eval.running.run_data import read_run
+from eval.running.results.run_data import read_run
 
 ROOT = Path(__file__).parents[1]
 MB = 1_000_000

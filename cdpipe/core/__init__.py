@@ -1,4 +1,4 @@
-"""Core: errors, poses, motion, voxel grid, grid index, plug-ins and the YAML reader; every other folder may use it."""
+"""Core: errors, geometry, files, isolated processes, plug-ins and progress; every other folder may use it."""
 
 import lazy_loader
 

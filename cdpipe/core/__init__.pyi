@@ -1,9 +1,17 @@
 from .errors import InputError, MergeFailedError, ScenarioError, TunnelcdError
-from .geometry import invert, make_pose, stream, transform, yaw_pose
-from .grid_index import GridIndex
-from .motion import Motion, make_motion
+from .geometry import (
+    GridIndex,
+    Motion,
+    cell_keys,
+    cell_means,
+    invert,
+    make_motion,
+    make_pose,
+    stream,
+    transform,
+    yaw_pose,
+)
 from .ranking import auroc, average_precision
-from .voxel import cell_keys, cell_means
 from .yamlfile import Document, Settings, read_yaml, validate
 
 __all__ = [

@@ -13,7 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, ValidationError, model_serializer
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files.plain_file import read_bytes
@@ -35,6 +35,22 @@ class Settings(BaseModel):
     renamed: ClassVar[Mapping[str, str]] = {}
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class GrownSettings(Settings):
+    """Settings whose dump leaves newer keys out while they have their defaults, so that older files keep their bytes.
+
+    Attributes:
+        newer: The keys that came later.
+    """
+
+    newer: ClassVar[frozenset[str]] = frozenset()
+
+    @model_serializer(mode="wrap")
+    def _without_newer_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        fields = type(self).model_fields
+        idle = {key for key in self.newer if getattr(self, key) == fields[key].default}
+        return {key: value for key, value in handler(self).items() if key not in idle}
 
 
 ModelT = TypeVar("ModelT", bound=BaseModel)

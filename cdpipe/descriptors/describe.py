@@ -16,7 +16,7 @@ import torch
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArraySpec, read_npz
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
-from cdpipe.core.path_frames import FRAMES
+from cdpipe.core.geometry.path_frames import FRAMES
 from cdpipe.descriptors.devices import compute, find_device
 from cdpipe.descriptors.handmade import HANDMADE, VERSION
 from cdpipe.descriptors.network import (

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, require_shape
-from cdpipe.core.voxel import cell_keys
+from cdpipe.core.geometry.voxel import cell_keys
 
 # Raised when the vectors change, so that stored ones are recomputed.
 VERSION = 1

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, invert, transform
-from cdpipe.core.grid_index import GridIndex
-from cdpipe.core.path_frames import path_frames
+from cdpipe.core.geometry.grid_index import GridIndex
+from cdpipe.core.geometry.path_frames import path_frames
 from cdpipe.descriptors.change_network import ChangeNetwork, load_change_network, load_trained_change_network
 from cdpipe.descriptors.sphere_image import CROP_M, pixels, render, sphere_image
 from cdpipe.descriptors.weights_file import digest, read_weights

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cdpipe.core.geometry import Float32Array, Float64Array
-from cdpipe.core.voxel import nearest_image
+from cdpipe.core.geometry.voxel import nearest_image
 
 ROWS = 32
 COLUMNS = 256

@@ -13,8 +13,8 @@ import torch
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array
-from cdpipe.core.grid_index import GridIndex
-from cdpipe.core.path_frames import path_frames
+from cdpipe.core.geometry.grid_index import GridIndex
+from cdpipe.core.geometry.path_frames import path_frames
 from cdpipe.descriptors.sphere_image import render
 from cdpipe.descriptors.sphere_network import (
     SECTORS,

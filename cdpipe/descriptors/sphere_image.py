@@ -1,9 +1,9 @@
 """The input image of the sphere descriptor: the tunnel wall around a keyframe, unrolled on a cylinder.
 
-The anchor frame is the sensor's own, or it stands on path and gravity (`sphere.frames`, `cdpipe.core.path_frames`). In
-the latter the image does not depend on how the sensor is mounted, held or turned. Rows are metres along its x axis,
-columns are the angle about it, and a pixel is the distance of its nearest point from the axis. Keyframes are a metre
-apart, so an image covers only 2 m of tunnel before and behind.
+The anchor frame is the sensor's own, or it stands on path and gravity (`sphere.frames`,
+`cdpipe.core.geometry.path_frames`). In the latter the image does not depend on how the sensor is mounted, held or
+turned. Rows are metres along its x axis, columns are the angle about it, and a pixel is the distance of its nearest
+point from the axis. Keyframes are a metre apart, so an image covers only 2 m of tunnel before and behind.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, invert, transform
-from cdpipe.core.grid_index import GridIndex
-from cdpipe.core.voxel import nearest_image
+from cdpipe.core.geometry.grid_index import GridIndex
+from cdpipe.core.geometry.voxel import nearest_image
 
 ROWS = 16
 COLUMNS = 96

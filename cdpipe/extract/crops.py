@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.core.grid_index import GridIndex, is_in_sphere
+from cdpipe.core.geometry.grid_index import GridIndex, is_in_sphere
 from cdpipe.model.types import MergedMaps, SessionName
 
 SESSIONS: tuple[SessionName, SessionName] = ("before", "after")

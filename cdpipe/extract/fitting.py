@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, make_pose, transform, yaw_pose
-from cdpipe.core.groups import label_groups
-from cdpipe.core.voxel import thin
+from cdpipe.core.geometry.groups import label_groups
+from cdpipe.core.geometry.voxel import thin
 from cdpipe.extract.shape import upright_box
 
 # Distance within which a point lies on the other surface, and scale of the likeness.

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array, invert, require_shape, transform
-from cdpipe.core.voxel import cell_means
+from cdpipe.core.geometry.voxel import cell_means
 from cdpipe.extract.crops import SESSIONS, Crops
 from cdpipe.extract.moves import find_moves
 from cdpipe.extract.remains import is_heap, is_part_of_remainder

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.core.groups import label_groups
-from cdpipe.core.voxel import cell_keys
+from cdpipe.core.geometry.groups import label_groups
+from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.model.config import ClusterConfig, ExtractConfig, OutlierConfig
 
 _MAX_DENSE_CELLS = 1 << 22

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array
-from cdpipe.core.voxel import cell_keys, cell_means
+from cdpipe.core.geometry.voxel import cell_keys, cell_means
 from cdpipe.extract.shape import ground_heights
 
 # Largest distance of a neighbour of the object, and to the other session for a point that stayed.

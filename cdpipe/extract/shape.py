@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError, cKDTree
 
 from cdpipe.core.geometry import Float64Array, yaw_pose
-from cdpipe.core.voxel import cell_keys
+from cdpipe.core.geometry.voxel import cell_keys
 
 # The ground at a place is the median over this many nearest columns, robust against a false return below the floor.
 _GROUND_COLUMNS = 5

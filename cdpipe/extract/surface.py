@@ -17,8 +17,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.core.groups import label_groups
-from cdpipe.core.voxel import cell_means
+from cdpipe.core.geometry.groups import label_groups
+from cdpipe.core.geometry.voxel import cell_means
 from cdpipe.merge.registration import Surface, search_nearest
 from cdpipe.model.config import ExtractConfig
 

@@ -12,8 +12,8 @@ from functools import partial
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform, travelled_m
-from cdpipe.core.groups import label_groups
-from cdpipe.core.voxel import cell_means
+from cdpipe.core.geometry.groups import label_groups
+from cdpipe.core.geometry.voxel import cell_means
 from cdpipe.extract.crops import DIRECTIONS, SESSIONS, Crops, Sphere
 from cdpipe.extract.objects import PointGroup, ReturnPool
 from cdpipe.extract.surface import (

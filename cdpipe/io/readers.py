@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.io.foreign.opening import HowToRead, Progress, folder_of_options, open_recording
+from cdpipe.core.progress import Progress, report_nothing
+from cdpipe.io.foreign.opening import HowToRead, folder_of_options, open_recording
 from cdpipe.io.foreign.scans import Repeats
 from cdpipe.io.foreign.sniff import OUSTER, RECORDING_SUFFIXES, guess_format
 from cdpipe.io.session import ScanChunk, Session, chunk_path, read_session
@@ -22,9 +23,7 @@ from cdpipe.model.types import PosedScan, ScanSource
 __all__ = ["RECORDING_SUFFIXES", "HowToRead", "RecordedScans", "open_session"]
 
 
-def open_session(
-    path: str | Path, how: HowToRead | None = None, report: Progress = lambda stage, done, total: None
-) -> ScanSource:
+def open_session(path: str | Path, how: HowToRead | None = None, report: Progress = report_nothing) -> ScanSource:
     """Open a session folder, or a recording of another format.
 
     Args:

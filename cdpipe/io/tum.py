@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_bytes
 from cdpipe.core.geometry import Float64Array
-from cdpipe.core.motion import Motion, make_motion
+from cdpipe.core.geometry.motion import Motion, make_motion
 
 TUM_LINE = "stamp tx ty tz qx qy qz qw"
 _UNIT_TOLERANCE = 1e-3

@@ -1,6 +1,6 @@
 from .free_space import free_space_votes, grazing_ray_count
 from .mapping import build_map, choose_keyframes
-from .odometry import estimate_motion
+from .poses.odometry import estimate_motion
 from .session_check import check_session
 
 __all__ = [

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.geometry import BoolArray, Float64Array, transform
-from cdpipe.core.voxel import cell_keys
+from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PointMap, PosedScan, ScanSource, WrappedScans
 
@@ -111,8 +111,8 @@ def _surface_of(point_map: PointMap) -> LiesOnSurface:
     return lies_on_surface
 
 
-def clear(source: ScanSource, config: MapConfig) -> ScanSource:
-    """Return a session as its map shall have it, `map.airborne`."""
+def clear_air(source: ScanSource, config: MapConfig) -> ScanSource:
+    """Return a session without the returns of mist and dust, or as it is where `map.airborne` keeps them."""
     return ClearScans(source) if config.airborne == "drop" else source
 
 

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
+from cdpipe.core.progress import Progress
 from cdpipe.model.types import PosedScan, ScanSource, WrappedScans
-
-OnStep = Callable[[str, int, int], None]
-"""Takes the name of a step, the work done and the total work."""
 
 
 class CountedScans(WrappedScans):
     """A session that tells how many scans were read each time that all are read: step `pass 1`, `pass 2`, ..."""
 
-    def __init__(self, source: ScanSource, on_step: OnStep) -> None:
+    def __init__(self, source: ScanSource, on_step: Progress) -> None:
         super().__init__(source)
         self._on_step, self._n_passes = on_step, 0
 

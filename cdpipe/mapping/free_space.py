@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.core.voxel import cell_keys, nearest_image
+from cdpipe.core.geometry.voxel import cell_keys, nearest_image
 from cdpipe.model.types import Float16Array, KeyframeViews
 
 ROWS = 64

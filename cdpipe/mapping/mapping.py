@@ -14,14 +14,14 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array, invert, transform, travelled_m
-from cdpipe.core.grid_index import column_keys
+from cdpipe.core.geometry.grid_index import column_keys
+from cdpipe.core.geometry.voxel import UniqueCells, cell_corners, cell_keys, max_coordinate_m
+from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.core.spooled import SpooledArray
-from cdpipe.core.voxel import UniqueCells, cell_corners, cell_keys, max_coordinate_m
 from cdpipe.mapping.airborne import ClearScans
-from cdpipe.mapping.consistency import make_consistent
-from cdpipe.mapping.counted import OnStep
 from cdpipe.mapping.free_space import COLUMNS, ROWS, render_view
 from cdpipe.mapping.movers import drop_movers
+from cdpipe.mapping.poses.consistency import make_consistent
 from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PLACES, KeyframeViews, PointMap, PosedScan, ScanSource
 
@@ -37,7 +37,7 @@ def build_map(
     source: ScanSource,
     config: MapConfig,
     batch_scans: int = _BATCH_SCANS,
-    on_step: OnStep = lambda step, done, total: None,
+    on_step: Progress = report_nothing,
 ) -> PointMap:
     """Build the map of a session, one point per occupied voxel of its odom frame, and choose keyframes.
 

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.core.groups import label_groups
+from cdpipe.core.geometry.groups import label_groups
 from cdpipe.core.spooled import SpooledArray
 from cdpipe.mapping.free_space import count_through_and_hit
 from cdpipe.model.types import KeyframeViews, PointMap

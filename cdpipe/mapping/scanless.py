@@ -8,7 +8,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.types import ScanSource
 
-# Both take free space for granted, or scans that the sensor made.
+# Stages of the mapping that need scans: switched off.
 _OFF = {"consistency": "none", "airborne": "keep", "movers": "keep"}
 # Sources that compare points alone.
 _SOURCES = ("m3c2", "m3c2-ep", "c2c", "voxel-diff")

@@ -24,8 +24,8 @@ import small_gicp
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, make_pose, require_shape
+from cdpipe.core.geometry.voxel import max_coordinate_m
 from cdpipe.core.plugins import has_extra, require_extra
-from cdpipe.core.voxel import max_coordinate_m
 
 # Far compared with any mine; the rounding of the library's float32 is 0.03 mm there.
 _VIEWPOINT_M = np.array([0.0, 0.0, -500.0])

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, make_pose, transform, transform_each, travelled_m
-from cdpipe.core.grid_index import GridIndex
+from cdpipe.core.geometry.grid_index import GridIndex
 from cdpipe.merge.evidence import plane_distances, sample_evenly
 from cdpipe.merge.registration import IndexedMap, search_nearest
 

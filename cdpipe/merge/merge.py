@@ -16,7 +16,7 @@ from time import perf_counter
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array, transform, travelled_m
-from cdpipe.mapping.recorded_frames import merge_as_mapped
+from cdpipe.mapping.poses.recorded_frames import merge_as_mapped
 from cdpipe.merge.candidates import find_candidates, find_closest_pair, list_tries
 from cdpipe.merge.evidence import explain_refusal
 from cdpipe.merge.global_registration import is_kiss_matcher_installed

@@ -26,8 +26,8 @@ from cdpipe.core.geometry import (
     plane_jacobian,
     transform,
 )
-from cdpipe.core.grid_index import GridIndex, column_keys
-from cdpipe.core.voxel import cell_keys
+from cdpipe.core.geometry.grid_index import GridIndex, column_keys
+from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.model.config import MergeConfig
 from cdpipe.model.types import PointMap
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray
-from cdpipe.core.voxel import thin
+from cdpipe.core.geometry.voxel import thin
 from cdpipe.methods.whole_map import PlacedMaps, WholeMap
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.types import SessionName

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform
-from cdpipe.core.grid_index import GridIndex
-from cdpipe.core.voxel import nearest_image
+from cdpipe.core.geometry.grid_index import GridIndex
+from cdpipe.core.geometry.voxel import nearest_image
 from cdpipe.methods.whole_map import PlacedMaps, WholeMap
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.types import SessionName

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, require_poses, require_shape, transform
-from cdpipe.core.voxel import cell_keys
+from cdpipe.core.geometry.voxel import cell_keys
 
 # Anchors stand 4 m apart. A wider blend smooths real bends away; a narrower one tears neighbouring points apart.
 _BLEND_M = 2.0

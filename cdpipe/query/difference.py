@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array
-from cdpipe.core.grid_index import GridIndex
+from cdpipe.core.geometry.grid_index import GridIndex
 from cdpipe.extract.point_comparison import is_within
 from cdpipe.model.config import QueryConfig
 from cdpipe.model.types import DescriptorSet, MergedMaps

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, Int64Array
-from cdpipe.core.grid_index import GridIndex
+from cdpipe.core.geometry.grid_index import GridIndex
 from cdpipe.model.config import QueryConfig
 from cdpipe.model.types import PointMap
 

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array, Int64Array, transform, travelled_m
+from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.core.threads import in_threads
-from cdpipe.core.voxel import cell_keys
 from cdpipe.model.types import MergedMaps, PointMap, SessionName
 from cdpipe.surface.motions import PathMotions
 

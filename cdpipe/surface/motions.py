@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, Int64Array, plane_jacobian
+from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.core.threads import allowed_threads, in_threads
-from cdpipe.core.voxel import cell_keys
 
 _STEP_M = 2.0
 _LEAST_OFFSETS = 100

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.core.geometry.voxel import cell_means
 from cdpipe.core.threads import allowed_threads, in_threads
-from cdpipe.core.voxel import cell_means
 from cdpipe.surface.cells import CELL_M, SurfaceCells
 
 _NEAREST = 80

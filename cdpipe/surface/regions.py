@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, Int32Array
-from cdpipe.core.groups import label_groups
+from cdpipe.core.geometry.groups import label_groups
 from cdpipe.model.report import SurfaceRegion
 from cdpipe.surface.places import SurfacePlaces
 

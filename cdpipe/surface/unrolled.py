@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, Int64Array, travelled_m
-from cdpipe.core.path_frames import path_frames
+from cdpipe.core.geometry.path_frames import path_frames
 
 _BIN_M = 1.0
 

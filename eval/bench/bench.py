@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from cdpipe.core.errors import InputError, TunnelcdError
+from cdpipe.core.progress import Progress
 from cdpipe.core.yamlfile import suggest
 from cdpipe.descriptors.sphere import anchor_frames, change_log_odds, describe_map
 from cdpipe.merge.merge import merge_maps
@@ -68,7 +69,7 @@ def choose(every: Contests, only: Sequence[str]) -> Contests:
     return {name: contest for name, contest in every.items() if not only or name in only}
 
 
-def measure(every: Contests, on_progress: Callable[[str, int, int], None] | None = None) -> dict[str, Any]:
+def measure(every: Contests, on_progress: Progress | None = None) -> dict[str, Any]:
     """Run the contests one after the other.
 
     Args:

@@ -20,7 +20,7 @@ from time import thread_time
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array, Int64Array, transform
-from cdpipe.core.groups import label_groups
+from cdpipe.core.geometry.groups import label_groups
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import use_threads
 from cdpipe.extract.crops import Crops, Sphere

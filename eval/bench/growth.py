@@ -15,6 +15,7 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.isolation import ProcessDiedError, run_isolated
+from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.core.yamlfile import suggest
 from eval.bench.exponents import fit_growth
 from eval.bench.growth_axes import Axis, list_axes, measure_size
@@ -50,7 +51,7 @@ def measure_growth(
     *,
     quick: bool = False,
     large: bool = False,
-    on_progress: Callable[[str, int, int], None] = lambda name, done, total: None,
+    on_progress: Progress = report_nothing,
     run: Callable[[Callable[[Any], Any], Any], Any] = run_isolated,
 ) -> dict[str, Any]:
     """Measure every size of some axes, and fit.

@@ -17,6 +17,7 @@ from typing import Any
 import cdpipe
 from cdpipe.core.errors import InputError
 from cdpipe.core.isolation import ProcessDiedError, run_isolated
+from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import use_threads
 from cdpipe.io.readers import open_session
@@ -46,7 +47,7 @@ def measure_profile(
     seed: int = 0,
     *,
     has_surface: bool = False,
-    on_progress: Callable[[str, int, int], None] = lambda name, done, total: None,
+    on_progress: Progress = report_nothing,
     run: Callable[[Callable[[Any], Any], Any], Any] = run_isolated,
 ) -> dict[str, Any]:
     """Simulate and compare a pair of each scenario, each in a process of its own.

@@ -120,7 +120,7 @@ def odometry(name: str = "kiss-icp") -> str:
     """Let a sensor stand still for three revolutions (kiss-icp, genz-icp)."""
     import numpy as np
 
-    from cdpipe.mapping.odometry import estimate_motion
+    from cdpipe.mapping.poses.odometry import estimate_motion
     from cdpipe.sensor.ouster import load_profile
 
     sensor = load_profile("os1-32-nominal", "512x10")

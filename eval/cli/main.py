@@ -14,14 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from cdpipe.core.threads import fix_threads
-from eval.cli import converting, tracing
-from eval.cli import leaderboard as commands_leaderboard
-from eval.cli import pair as commands_pair
-from eval.cli import run as commands_run
-from eval.cli import stories as commands_stories
-from eval.cli import tools as commands_tools
-from eval.cli import training as commands_training
-from eval.cli import world as commands_world
+from eval.cli.commands import converting, leaderboard, pair, run, stories, tools, tracing, training, viewing, world
 from eval.core.exits import input_errors, run_app
 from eval.core.printing import echo
 
@@ -76,32 +69,32 @@ def options(
 
 # in the order in which --help tells them
 _COMMANDS: dict[str, Callable[..., None]] = {
-    "demo": commands_run.demo,
-    "simulate": commands_world.simulate,
-    "pair": commands_stories.pair,
-    "graft": commands_world.graft,
-    "survey": commands_world.survey,
-    "view": commands_world.view,
-    "describe": commands_pair.describe,
-    "detect": commands_pair.detect,
-    "story": commands_stories.story_command,
+    "demo": run.demo,
+    "simulate": world.simulate,
+    "pair": stories.pair,
+    "graft": world.graft,
+    "survey": world.survey,
+    "view": viewing.view,
+    "describe": pair.describe,
+    "detect": pair.detect,
+    "story": stories.story_command,
     "convert": converting.convert,
     "trace": tracing.trace,
-    "score": commands_run.score,
-    "run": commands_run.run_command,
-    "merge-runs": commands_run.merge_runs_command,
-    "export": commands_run.export,
-    "template": commands_leaderboard.template,
-    "evaluate": commands_leaderboard.evaluate,
-    "submit": commands_leaderboard.submit,
-    "leaderboard": commands_leaderboard.leaderboard,
-    "report": commands_run.report,
-    "dataset": commands_training.dataset,
-    "train": commands_training.train,
-    "bench": commands_tools.bench,
-    "list": commands_tools.list_command,
-    "check": commands_tools.check,
-    "doctor": commands_tools.doctor,
+    "score": run.score,
+    "run": run.run_command,
+    "merge-runs": run.merge_runs_command,
+    "export": run.export,
+    "template": leaderboard.template,
+    "evaluate": leaderboard.evaluate,
+    "submit": leaderboard.submit,
+    "leaderboard": leaderboard.leaderboard,
+    "report": run.report,
+    "dataset": training.dataset,
+    "train": training.train,
+    "bench": tools.bench,
+    "list": tools.list_command,
+    "check": tools.check,
+    "doctor": tools.doctor,
 }
 for _name, _command in _COMMANDS.items():
     app.command(_name)(_command)

@@ -39,7 +39,7 @@ def _plan_names() -> list[str]:
     from cdpipe.core.plugins import find_yaml
 
     # as `eval.plans.files` has it, which takes a second to import
-    return list(find_yaml("plans", resources.files("eval") / "plans"))
+    return list(find_yaml("plans", resources.files("eval") / "plans" / "shipped"))
 
 
 def _preset_names() -> list[str]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from cdpipe.core.errors import InputError, MergeFailedError, ScenarioError
 from cdpipe.core.geometry import Float64Array
+from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.io.foreign import HowToRead, guess_format
 from cdpipe.io.foreign.sniff import OUSTER
 from cdpipe.io.known_merge import read_known_merge
@@ -26,10 +27,8 @@ from sim.graft import Recorded, graft_in_memory, graft_pair
 from sim.session.simulate import HeldPair, simulate_pair
 from sim.story.afters import simulate_afters
 
-OnStage = Callable[[str, int, int], None]
 
-
-def make_pair(scenario: Scenario, seed: int, out: Path, on_progress: OnStage = lambda stage, done, total: None) -> None:
+def make_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progress = report_nothing) -> None:
     """Write the pair of a scenario into a folder that does not exist or is empty: `before`, `after` and `truth`.
 
     Raises:
@@ -64,7 +63,7 @@ def make_afters(scenario: Scenario, plans: Sequence[SessionPlan], seed: int) -> 
 
 
 @contextmanager
-def open_recorded(recording: Recording, on_progress: OnStage = lambda stage, done, total: None) -> Iterator[Recorded]:
+def open_recorded(recording: Recording, on_progress: Progress = report_nothing) -> Iterator[Recorded]:
     """Open the recordings of a pair, and find their merge where it is not given.
 
     Raises:
@@ -90,7 +89,7 @@ def _how(recording: Recording, number: int) -> HowToRead:
     return HowToRead(*told)
 
 
-def _open(path: Path, how: HowToRead, folder: Path, on_progress: OnStage) -> Session:
+def _open(path: Path, how: HowToRead, folder: Path, on_progress: Progress) -> Session:
     """Open a recording as a session; an OSF or PCAP is written into a folder first."""
     name = how.format or guess_format(path)
     if name == "session":
@@ -111,7 +110,7 @@ def _open(path: Path, how: HowToRead, folder: Path, on_progress: OnStage) -> Ses
     return read_session(session)
 
 
-def _find_merge(sessions: tuple[Session, ...], on_progress: OnStage) -> Float64Array:
+def _find_merge(sessions: tuple[Session, ...], on_progress: Progress) -> Float64Array:
     """Return `before_T_after` (4, 4) as preset `tunnelcd` finds it.
 
     Raises:

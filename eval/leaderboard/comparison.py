@@ -18,8 +18,8 @@ from eval.leaderboard.reference import take_other_methods
 from eval.report.compared_columns import COMPARED, figures_of, is_time
 from eval.report.comparing import paired_differences, verdict
 from eval.report.render import write_file
-from eval.running.run_data import RunData
-from eval.running.sides import find_other_worlds
+from eval.running.results.run_data import RunData
+from eval.running.results.sides import find_other_worlds
 from eval.tables.rows import PAIR, is_told_the_truth, numbers
 
 FIGURES = ("region_recall", "false_regions_per_100m", "object_iou_point", "object_f1_50", "t_total_s")

@@ -43,7 +43,7 @@ from eval.running.pair_run import TOOLS, Pair, Tools, pair_lock, score_unmade
 from eval.running.predictions import require_current_scores, require_free_name
 from eval.running.runfolder import RunFolder, write_json, write_tables
 from eval.running.runner import list_plan_pairs, open_pair, start_provenance
-from eval.running.stages import PairStages
+from eval.running.stages.pair_stages import PairStages
 from eval.scoring.scoring import METRICS_VERSION, CaseScore, score_stored
 from eval.truth.ground_truth import GroundTruth
 

@@ -11,7 +11,7 @@ from cdpipe.io.known_merge import write_alignment
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.config import load_config
 from eval.oracles.merge import OracleMerge, align_by_truth
-from eval.running.stages import PairStages
+from eval.running.stages.pair_stages import PairStages
 from eval.truth.ground_truth import GroundTruth
 
 MergeMode = Literal["given", "ours", "own"]

@@ -26,7 +26,7 @@ from eval.leaderboard.comparison import (
 from eval.leaderboard.reference import find_reference
 from eval.leaderboard.submission import CheckedFile
 from eval.report.render import render_page, write_file
-from eval.running.run_data import RunData
+from eval.running.results.run_data import RunData
 
 _MERGES = {"own": "its own", "given": "told the true one", "ours": "told tunnelcd's"}
 

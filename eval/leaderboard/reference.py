@@ -8,8 +8,8 @@ from pathlib import Path
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import path_part
 from eval.core.tablefile import table_file
-from eval.running.run_data import RunData, read_run
-from eval.running.sides import list_versions
+from eval.running.results.run_data import RunData, read_run
+from eval.running.results.sides import list_versions
 from eval.scoring.scoring import METRICS_VERSION
 
 REPORTS = Path(__file__).parents[2] / "reports"

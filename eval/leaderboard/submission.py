@@ -32,7 +32,7 @@ from eval.core.provenance import git_commit, machine, versions
 from eval.leaderboard.evaluation import EvaluationFile, digest_method, digest_pair, read_call, read_evaluation
 from eval.leaderboard.given_merge import MergeMode
 from eval.running.cell_rows import TEXT_COLUMNS
-from eval.running.run_data import LARGEST
+from eval.running.results.tables import LARGEST
 from eval.running.runfolder import RunFolder, json_text
 from eval.scoring.scoring import METRICS_VERSION, score_stored
 from eval.truth.ground_truth import load_ground_truth

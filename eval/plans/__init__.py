@@ -1,4 +1,4 @@
-"""Plans: which worlds, seeds and variants a run holds; the shipped plans are the YAML files here."""
+"""Plans: which worlds, seeds and variants a run holds; `shipped` has those that come with the package."""
 
 import lazy_loader
 

@@ -1,6 +1,8 @@
+from .cells import expand_cells
 from .changes import change_plan
 from .files import plan_names
-from .plan import Plan, expand_cells, load_plan, parse_seeds
+from .plan import Plan, load_plan
+from .seeds import parse_seeds
 from .variants import Cell
 
 __all__ = [

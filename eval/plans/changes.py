@@ -11,7 +11,8 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files import parse_yaml_value
 from cdpipe.core.yamlfile import Document, validate
 from eval.plans.parts import get_key, has_effect_on_true_regions, require_valid_setting, require_valid_settings
-from eval.plans.plan import Plan, parse_seeds
+from eval.plans.plan import Plan
+from eval.plans.seeds import parse_seeds
 from eval.plans.splits import SplitName, seal_seeds, version_name
 from eval.plans.worlds import get_group
 

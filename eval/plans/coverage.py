@@ -8,7 +8,8 @@ from typing import Any
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import Document, validate
-from eval.plans.plan import Plan, list_planned_cases
+from eval.plans.cells import list_planned_cases
+from eval.plans.plan import Plan
 
 
 @dataclass(frozen=True, slots=True)

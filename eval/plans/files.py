@@ -66,4 +66,4 @@ def _resolve_files(document: Document, folder: Path) -> Document:
 
 def plan_files() -> dict[str, Traversable]:
     """Return the file of every plan by its name: shipped, and on the search path."""
-    return find_yaml("plans", resources.files("eval") / "plans")
+    return find_yaml("plans", resources.files("eval") / "plans" / "shipped")

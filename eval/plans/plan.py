@@ -32,7 +32,6 @@ axes:                                # eval/plans/axes.py: the first scenario, m
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Annotated, Any, Literal
@@ -56,8 +55,9 @@ from cdpipe.model.config import OF_WHOLE_MAPS, Site
 from eval.plans.axes import Axis, harder_item, method_steps
 from eval.plans.files import read_plan
 from eval.plans.parts import Grid, Label, MethodSettings, NotEmpty, Variant, get_key
+from eval.plans.seeds import parse_seeds
 from eval.plans.targets import PlanTargets, Targets
-from eval.plans.variants import Cell, Method, Until
+from eval.plans.variants import Method, Until
 from eval.plans.worlds import (
     OWN_ODOMETRY,
     Odometries,
@@ -71,7 +71,6 @@ from eval.plans.worlds import (
     world_slug,
 )
 
-_MOST_SEEDS = 100_000
 _NO_THRESHOLDS: Mapping[str, Any] = {"thresholds": {}}
 _MAY_BE_LEFT_OUT = ("split", "set", "thresholds", "axes")
 _AFTER_MERGE = ("query", "extract", "outlier", "cluster", *OF_WHOLE_MAPS)
@@ -212,43 +211,6 @@ def _find_misfit_steps(plan: Plan) -> Iterator[InitErrorDetails]:
                 yield _mistake(("axes", place, "steps", index, "set"), ",".join(step.set), str(error))
 
 
-def parse_seeds(value: Any) -> tuple[int, ...]:
-    """Return the seeds of "A:B" (B excluded), of "A", or of a list of non-negative numbers.
-
-    Raises:
-        ValueError: It has another form, is empty, or names a seed twice.
-    """
-    rule = 'expected "A:B" in quotes (B excluded) or a list of seeds, all 0 or larger'
-    if isinstance(value, str):
-        match = re.fullmatch(r"(\d{1,15})(?::(\d{1,15}))?", value.strip())
-        if match is None:
-            raise ValueError(rule)
-        first, end = int(match[1]), int(match[2] or match[1]) + (match[2] is None)
-        if end - first > _MOST_SEEDS:
-            raise ValueError(f"{rule}; at most {_MOST_SEEDS} of them")
-        value = list(range(first, end))
-        if not value:
-            raise ValueError(f"{rule}; this range is empty")
-    # YAML 1.1 reads an unquoted 1:40 as the number 100, so a bare number is refused
-    if not isinstance(value, list | tuple) or not value:
-        raise ValueError(rule)
-    if not all(type(seed) is int and seed >= 0 for seed in value) or len(set(value)) < len(value):
-        raise ValueError(f"{rule}, none twice")
-    return tuple(value)
-
-
-def parse_seeds_option(text: str) -> tuple[int, ...]:
-    """Return the seeds that the option --seeds names.
-
-    Raises:
-        InputError: It is no range of seeds.
-    """
-    try:
-        return parse_seeds(text)
-    except ValueError as error:
-        raise InputError(f"--seeds {text}: {error}") from error
-
-
 def _list_subjects(value: Any) -> Any:
     return [value] if isinstance(value, str) else () if value is None else value
 
@@ -354,38 +316,3 @@ def _with_threshold(method: Method, threshold: float | None) -> Method:
     if threshold is None:
         return method
     return replace(method, silent=(*method.silent, f"query.threshold={threshold!r}"))
-
-
-def expand_cells(plan: Plan) -> list[Cell]:
-    """Return all cells: by scenario, then seed, then variant, grids last.
-
-    Raises:
-        InputError: The settings of a variant contradict each other or its preset.
-    """
-    found: list[Cell] = []
-    mistakes: list[str] = []
-    for world in plan.worlds:
-        methods = []
-        for method in list_methods(plan, world):
-            try:
-                methods.append((method, method.config()))
-            except InputError as error:
-                mistakes += str(error).split("\n")
-        found += [
-            method.cell(world, seed, config, plan.until)
-            for seed in plan.seeds[: world.n_seeds]
-            for method, config in methods
-        ]
-    if mistakes:
-        raise InputError("\n".join(dict.fromkeys(mistakes)))
-    return found
-
-
-def list_planned_cases(plan: Plan) -> set[tuple[str, int, str]]:
-    """Return (scenario, seed, variant) of all cells."""
-    return {
-        (world.label, seed, method.variant)
-        for world in plan.worlds
-        for method in list_methods(plan, world)
-        for seed in plan.seeds[: world.n_seeds]
-    }

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.yamlfile import Settings, read_yaml, suggest, validate
-from eval.plans.plan import parse_seeds_option
+from eval.plans.seeds import parse_seeds_option
 from eval.plans.splits import load_splits, version_name
 from scenarios.library import load_scenario
 from scenarios.references import file_digests

@@ -22,7 +22,7 @@ from eval.report.comparing import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORS
 from eval.report.render import render_page, write_file
 from eval.report.settings.effects import effect_chart, signed
 from eval.report.tables import Cell, Picture, Table
-from eval.running.sides import Side, cautions, only_in, short_names, why_no_times
+from eval.running.results.sides import Side, cautions, only_in, short_names, why_no_times
 from eval.tables.columns import Column, spaced
 from eval.tables.rows import DOMAINS, records
 

@@ -20,7 +20,8 @@ from eval.core.domains import domain_name
 from eval.core.statistics import mean, mean_with_interval, median
 from eval.report.drawing.charts import Chart
 from eval.report.drawing.looks import look_of
-from eval.running.run_data import RunData, comparable, stored_table
+from eval.running.results.cases import comparable
+from eval.running.results.run_data import RunData, stored_table
 from eval.tables.rows import ALL_DOMAINS, DOMAINS, is_told_the_truth, numbers, records
 
 _RECALL_AT_RATE, _RECALL_AT_K, _F1 = "recall_at_0.1", "region_recall_at_k", "object_f1_50"

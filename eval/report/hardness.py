@@ -13,7 +13,7 @@ from eval.core.charts import Axis, Drawing, Look, Panel, Series, named_ticks
 from eval.report.drawing.charts import Chart
 from eval.report.drawing.looks import look_of
 from eval.report.tables import Cell, Table
-from eval.running.run_data import RunData, stored_table
+from eval.running.results.run_data import RunData, stored_table
 from eval.tables.columns import UNDEFINED, share, spaced
 from eval.tables.hardness import BROKEN_BELOW
 from eval.tables.rows import records

@@ -24,8 +24,10 @@ from eval.report.objects.tables import OBJECT_COLUMNS
 from eval.report.regions.regions import REGION_COLUMNS
 from eval.report.summary import is_unmade, means_by_method
 from eval.report.tables import Table, methods_table
-from eval.running.run_data import RunData, comparable, off_grids, plan_name, stored_table
-from eval.running.sides import Side, is_contended
+from eval.running.results.cases import comparable
+from eval.running.results.grids import off_grids
+from eval.running.results.run_data import RunData, plan_name, stored_table
+from eval.running.results.sides import Side, is_contended
 from eval.tables.columns import EN_DASH, RESULT_COLUMNS, THIN_SPACE, Column, select
 from eval.tables.rows import ALL_DOMAINS, PAIR, is_told_the_truth, numbers, records, texts, with_domain
 

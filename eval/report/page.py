@@ -48,23 +48,12 @@ from eval.report.site.worst import draw_worst, worst_rows
 from eval.report.summary import HEADLINES, draw_summary
 from eval.report.surface.surface import SURFACE_COLUMNS, draw_surface
 from eval.report.tables import Cell, Table, results_table, to_csv, unchanged_table
-from eval.running.run_data import (
-    RunData,
-    ends_at_merge,
-    figures_of_plan,
-    first_seed,
-    flag,
-    named_variants,
-    of,
-    plan_name,
-    read_run,
-    scenarios,
-    shown_variant,
-    text,
-)
+from eval.running.results.cases import first_seed, named_variants, scenarios
+from eval.running.results.run_data import RunData, ends_at_merge, figures_of_plan, plan_name, read_run, shown_variant
+from eval.running.results.sides import Side, check_extras, check_versions, is_contended
+from eval.running.results.values import flag, select_rows, text
 from eval.running.runfolder import read_json
 from eval.running.scaling.remaking import remade_when_asked
-from eval.running.sides import Side, check_extras, check_versions, is_contended
 from eval.tables.columns import RESULT_COLUMNS, TIME_MEANINGS, UNDEFINED
 from eval.tables.merge_table import merge_table
 
@@ -300,7 +289,7 @@ def tabulate_settings(data: RunData) -> Table:
     for scenario in [*scenarios(data, unchanged=False), *scenarios(data, unchanged=True)]:
         seed = first_seed(data, scenario)
         for name in named_variants(data, scenario):
-            if of(data.results, scenario=scenario, seed=seed, variant=name):
+            if select_rows(data.results, scenario=scenario, seed=seed, variant=name):
                 document = read_json(data.folder.answer(scenario, seed, name) / "answer.json")
                 config = document.get("config")
                 found.setdefault(name, []).append(_flat(config) if isinstance(config, Mapping) else {})

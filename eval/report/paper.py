@@ -6,17 +6,9 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 from eval.report.tables import Cell, Table
-from eval.running.run_data import (
-    Row,
-    RunData,
-    defined,
-    named_variants,
-    of,
-    over_pairs,
-    pictured_variants,
-    scenarios,
-    text,
-)
+from eval.running.results.cases import named_variants, pictured_variants, scenarios
+from eval.running.results.run_data import RunData
+from eval.running.results.values import Row, defined, over_pairs, select_rows, text
 from eval.tables.columns import EN_DASH, THIN_SPACE, UNDEFINED, count, significant
 
 # Stathoulopoulos, Koval, Nikolakopoulos, IROS 2023, as printed; "-" alone: the paper gives no value
@@ -43,7 +35,7 @@ def time_table(data: RunData) -> Table:
     """Return Table I: medians over the pairs."""
 
     def ours(scenario: str, variant: str) -> list[str]:
-        group = of(data.results, scenario=scenario, variant=variant)
+        group = select_rows(data.results, scenario=scenario, variant=variant)
         return [significant(over_pairs(group, column)) for column in _TIMES.values()]
 
     return _beside_the_paper(data, tuple(_TIMES), _PUBLISHED_TIMES, ours, "Table I: time")
@@ -56,8 +48,8 @@ def volume_table(data: RunData) -> Table:
     """
 
     def ours(scenario: str, variant: str) -> list[str]:
-        group = of(data.results, scenario=scenario, variant=variant)
-        candidates = of(data.regions, scenario=scenario, variant=variant)
+        group = select_rows(data.results, scenario=scenario, variant=variant)
+        candidates = select_rows(data.regions, scenario=scenario, variant=variant)
         regions = [row for row in candidates if text(row, "outcome") in ("true", "duplicate")]
         sizes = (_whole(over_pairs(group, f"map_points_{name}")) for name in ("before", "after"))
         volumes = (_range(regions, column, significant) for column in ("v_sphere_m3", "v_oe_m3"))

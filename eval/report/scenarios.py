@@ -9,7 +9,10 @@ import numpy as np
 from eval.core.charts import Axis, Drawing, Panel, Series, named_ticks
 from eval.report.drawing.charts import Chart
 from eval.report.drawing.looks import look_of
-from eval.running.run_data import RunData, interval_over_pairs, named_variants, of, over_pairs, scenarios, split_variant
+from eval.running.results.cases import named_variants, scenarios
+from eval.running.results.grids import split_variant
+from eval.running.results.run_data import RunData
+from eval.running.results.values import interval_over_pairs, over_pairs, select_rows
 from eval.tables.columns import RESULT_COLUMNS, select
 
 _COLUMNS = select(RESULT_COLUMNS, "region_recall_at_k", "region_auroc", "object_iou_point", "object_f1_50")
@@ -22,12 +25,12 @@ def draw_scenarios(data: RunData) -> list[Chart]:
     methods = list(dict.fromkeys(name for world in worlds for name in named_variants(data, world)))
     # what is set over a method belongs to the charts of settings
     methods = [name for name in methods if not split_variant(name)[1]][:_MAX_METHODS]
-    sizes = {world: len({row["seed"] for row in of(data.results, scenario=world)}) for world in worlds}
+    sizes = {world: len({row["seed"] for row in select_rows(data.results, scenario=world)}) for world in worlds}
     if len(methods) < 2 or max(sizes.values(), default=0) < 2:
         return []
     ticks = named_ticks([f"{world.replace('/', '/' + chr(10))}\nn {sizes[world]}" for world in worlds])
     values: dict[tuple[str, str], list[Any]] = {
-        (world, name): of(data.results, scenario=world, variant=name) for world in worlds for name in methods
+        (world, name): select_rows(data.results, scenario=world, variant=name) for world in worlds for name in methods
     }
     rows = []
     for column in _COLUMNS:

@@ -16,20 +16,12 @@ from eval.report.compared_columns import COMPARED, POOLED, figures_of, is_time
 from eval.report.merge.tables import name_kinds
 from eval.report.surface.surface import SURFACE_COLUMNS
 from eval.report.tables import Cell, Table, methods_table, written_interval
-from eval.running.run_data import (
-    Row,
-    RunData,
-    comparable,
-    covered_by,
-    ends_at_merge,
-    number,
-    off_grids,
-    shown_variant,
-    stored_table,
-    text,
-)
+from eval.running.results.cases import comparable
+from eval.running.results.grids import off_grids
+from eval.running.results.run_data import RunData, covered_by, ends_at_merge, shown_variant, stored_table
+from eval.running.results.sides import is_contended
+from eval.running.results.values import Row, number, text
 from eval.running.runfolder import reported
-from eval.running.sides import is_contended
 from eval.scoring.surface_windows import AREAS_M2
 from eval.tables.columns import Column, fine, select, share, spaced
 from eval.tables.merge_table import ALL_FAMILIES, RIGHT_DEG, RIGHT_M

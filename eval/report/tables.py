@@ -14,18 +14,9 @@ import pandas as pd
 from eval.core.domains import domain_name
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.report.drawing.charts import Chart
-from eval.running.run_data import (
-    Row,
-    RunData,
-    defined,
-    flag,
-    interval_over_pairs,
-    named_variants,
-    of,
-    over_pairs,
-    scenarios,
-    text,
-)
+from eval.running.results.cases import named_variants, scenarios
+from eval.running.results.run_data import RunData
+from eval.running.results.values import Row, defined, flag, interval_over_pairs, over_pairs, select_rows, text
 from eval.tables.columns import (
     EN_DASH,
     RESULT_COLUMNS,
@@ -116,7 +107,7 @@ def results_table(data: RunData) -> Table:
     rows: list[tuple[str, tuple[Cell, ...]]] = []
     for scenario in scenarios(data, unchanged=False):
         variants = named_variants(data, scenario)
-        groups = [of(data.results, scenario=scenario, variant=name) for name in variants]
+        groups = [select_rows(data.results, scenario=scenario, variant=name) for name in variants]
         columns = [_column_cells(variants, groups, column) for column in RESULT_COLUMNS]
         rows += [
             (scenario, (Cell(spaced(name)), *(column[index] for column in columns), Cell(status_text(groups[index]))))
@@ -131,7 +122,7 @@ def unchanged_table(data: RunData) -> Table:
     rows: list[tuple[str, tuple[Cell, ...]]] = []
     for scenario in scenarios(data, unchanged=True):
         for name in named_variants(data, scenario):
-            group = of(data.results, scenario=scenario, variant=name)
+            group = select_rows(data.results, scenario=scenario, variant=name)
             values = (Cell(column.shown(over_pairs(group, column.key))) for column in UNCHANGED_COLUMNS)
             rows.append((scenario, (Cell(spaced(name)), Cell(alarm_text(group)), *values, Cell(status_text(group)))))
     return Table(headings, tuple(rows), "Pairs in which nothing changed")

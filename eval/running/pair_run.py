@@ -18,12 +18,12 @@ import numpy as np
 
 from cdpipe.core.errors import InputError, MergeFailedError, ScenarioError, TunnelcdError
 from cdpipe.core.plugins import extra_version
+from cdpipe.core.progress import Progress
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import checkpoint_digest, list_checkpoints, use_threads
 from cdpipe.io.answer import write_answer, write_failure
 from cdpipe.methods.registry import PACKAGES, list_extras
 from cdpipe.model.config import WEIGHTS, MapConfig
-from cdpipe.pipeline import OnStage
 from eval.core.domains import domain_of
 from eval.core.output import remove, whole_file
 from eval.core.progress import RunProgress
@@ -35,8 +35,8 @@ from eval.plans.variants import Cell
 from eval.running.cell_file import cell_document
 from eval.running.runfolder import RunFolder, write_json
 from eval.running.scaling.keeping import Keep, dropped_file, read_dropped, require_same_bytes
-from eval.running.stage_cache import open_cache
-from eval.running.stages import PairStages
+from eval.running.stages.pair_stages import PairStages
+from eval.running.stages.stage_cache import open_cache
 from eval.scoring.scoring import METRICS_VERSION, CaseScore, describe_recording, score_stored
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
@@ -102,7 +102,7 @@ class Tools:
     """
 
     draw: Callable[[str, int, tuple[str, ...]], Scenario] = load_scenario
-    simulate: Callable[[Scenario, int, Path, OnStage], None] = make_pair
+    simulate: Callable[[Scenario, int, Path, Progress], None] = make_pair
     commit: Callable[[], str | None] = git_commit
     now: Callable[[], str] = now
 

@@ -25,13 +25,13 @@ from cdpipe.model.config import preset_names
 from eval.core.output import remove
 from eval.core.progress import RunProgress, Silent
 from eval.core.tablefile import read_table
+from eval.plans.cells import list_planned_cases
 from eval.plans.coverage import read_stored_plan
-from eval.plans.plan import list_planned_cases
 from eval.running.cell_file import LAST, NO_KEY, cell_document
 from eval.running.export import copy_pair, list_pairs, list_pairs_blindly, name_blindly
 from eval.running.rescoring import foreign_identity
+from eval.running.results.sides import list_versions
 from eval.running.runfolder import RunFolder, open_run_folder, write_json, write_tables
-from eval.running.sides import list_versions
 from eval.scoring.scoring import METRICS_VERSION, score_stored
 from eval.truth.ground_truth import load_ground_truth
 

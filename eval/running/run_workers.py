@@ -202,7 +202,7 @@ def work_on(document: str) -> str:
     return ""
 
 
-def open_or_do(document: str) -> None:
+def open_and_run(document: str) -> None:
     """Open a task's pair, and run its cells; runs in a process of its own."""
     task = _TASK.validate_json(document)
     alone = PairRun(RunFolder(task.folder), task.pair, task.made, Silent())
@@ -239,7 +239,7 @@ def _death_of_cell(task: Task, here: PairRun, each: Todo, trace: Path) -> str:
 def _death_alone(task: Task) -> str:
     """Run a task in a process of its own, and return what killed it, "" if nothing did."""
     try:
-        run_isolated(open_or_do, task.as_json())
+        run_isolated(open_and_run, task.as_json())
     except ProcessDiedError as death:
         return str(death)
     return ""

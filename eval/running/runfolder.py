@@ -5,7 +5,7 @@ blind.json                                    opaque names of the pairs (eval.ru
 pairs/<world>/<seed>/{before,after,truth}     simulated pairs; a world is a scenario, with what is set over it
 answers/<world>/<seed>/<variant>/             raw answers (cdpipe.io.answer)
 maps/<world>/<seed>.npz                       thinned maps for pictures
-stages/<world>/<seed>/                        what the pipeline's stages gave (eval.running.stage_cache); may be removed
+stages/<world>/<seed>/                        what the pipeline's stages gave (eval.running.stages); may be removed
 cells/<world>/<seed>/<variant>.json           a finished cell: key, order, row, items
 results.csv changes.csv regions.csv objects.csv keyframes.csv summary.csv
 surface_changes.csv surface_windows.csv       where rock moved, or an answer says so

@@ -23,7 +23,8 @@ from eval.core.cluster import HERE, Where, connected, require_usable
 from eval.core.output import remove
 from eval.core.progress import RunProgress, Silent
 from eval.core.provenance import describe_run, digest
-from eval.plans.plan import Plan, expand_cells
+from eval.plans.cells import expand_cells
+from eval.plans.plan import Plan
 from eval.plans.variants import Cell
 from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Tools, pair_lock
 from eval.running.run_workers import remove_traces, run_on_workers
@@ -33,7 +34,7 @@ from eval.running.scaling.mirror import Mirror
 from eval.running.scaling.remaking import remake_pair
 from eval.running.scaling.shards import Shard, choose_cells, require_same_shard
 from eval.running.schedule import limit_pairs, schedule_pairs
-from eval.running.stages import PairStages
+from eval.running.stages.pair_stages import PairStages
 from eval.truth.ground_truth import GroundTruth
 from sim.session.truth import read_pair_truth
 

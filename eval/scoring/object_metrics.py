@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.core.voxel import cell_keys
+from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.model.report import ChangedObject
 from eval.core.statistics import mean
 from eval.scoring.twins import is_kind_right, label_changes

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.core.voxel import cell_keys
+from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.model.report import SurfaceField
 from eval.truth.ground_truth import GroundTruth, SurfaceLabels
 

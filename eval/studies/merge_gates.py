@@ -2,7 +2,7 @@
 
 Run as `python -m eval.studies.merge_gates RUN --out DIR`, where RUN is the folder of `tunnelcd run merge-gates`. Its
 variant sets `merge.accept_all`, so that every best hypothesis is kept with its evidence, right or wrong. The program
-writes DIR/gates.csv and DIR/gates.png. Thresholds go into cdpipe/model/config.py by hand, so that none changes
+writes DIR/gates.csv and DIR/gates.png. Thresholds go into cdpipe/model/config/mapping.py by hand, so that none changes
 unnoticed.
 
 The search stops at the present gates even under `merge.accept_all`: the next candidate, and KISS-Matcher, are tried
@@ -29,8 +29,8 @@ from eval.core.exits import run_program
 from eval.core.figures import picture, png
 from eval.core.output import make_writable
 from eval.core.printing import echo
+from eval.plans.cells import expand_cells
 from eval.plans.coverage import read_stored_plan
-from eval.plans.plan import expand_cells
 from eval.running.runfolder import read_json
 from eval.studies.calibrate import read_table
 from eval.tables.merge_table import RULES, is_accepted, is_right, kinds

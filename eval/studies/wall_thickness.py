@@ -18,9 +18,9 @@ import pandas as pd
 import typer
 
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, transform_each
-from cdpipe.core.voxel import cell_keys
+from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.io.readers import open_session
-from cdpipe.mapping.consistency import make_consistent
+from cdpipe.mapping.poses.consistency import make_consistent
 from cdpipe.model.types import ScanSource, SessionName
 from eval.core.exits import run_program
 from eval.core.printing import echo

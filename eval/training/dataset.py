@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, stream, transform, yaw_rad
-from cdpipe.core.grid_index import GridIndex
-from cdpipe.core.path_frames import FRAMES, path_frames
+from cdpipe.core.geometry.grid_index import GridIndex
+from cdpipe.core.geometry.path_frames import FRAMES, path_frames
 from cdpipe.descriptors import sphere_image
 from cdpipe.descriptors.range_image import range_image
 from cdpipe.descriptors.sphere_image import COLUMNS, CROP_M, HALF_LENGTH_M, REACH_M, ROWS, pixels, render

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArraySpec, read_npz
 from cdpipe.core.geometry import Float32Array, Int32Array, Int64Array, require_shapes, transform
-from cdpipe.core.voxel import cell_keys
+from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import Session, chunk_path, read_session
 from cdpipe.model.types import PosedScan

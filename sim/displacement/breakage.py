@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,7 +33,6 @@ _FILL_SLOPE = 1 / 3  # a ramp that a robot climbs
 _FILL_ROUGH = ((0.03, 1.2), (0.012, 0.25))  # standard deviation and correlation length, metres
 _FILL_EDGE_M = 0.12
 _HALVINGS = 40
-Level = Callable[[Float64Array], Float64Array]
 
 
 def break_out(walls: TwinWalls, zone: Zone, change: SurfaceChange, seed: int) -> Moved:

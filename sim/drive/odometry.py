@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array, Int64Array, stream
-from cdpipe.core.motion import Motion, make_motion
+from cdpipe.core.geometry.motion import Motion, make_motion
 from cdpipe.io.tum import motion_through, read_trajectory
-from cdpipe.mapping.odometry import estimate_motion
+from cdpipe.mapping.poses.odometry import estimate_motion
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Odometry
 
@@ -203,7 +203,7 @@ def register_scans(
     odom_T_first: Float64Array,
     session: str,
 ) -> Motion:
-    """Return the movement that KISS-ICP finds in a session's revolutions: `cdpipe.mapping.odometry.estimate_motion`.
+    """Return the movement that KISS-ICP finds in a session's revolutions (`cdpipe.mapping.estimate_motion`).
 
     Raises:
         ScenarioError: A pose is not finite; the message names the session.

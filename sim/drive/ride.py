@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, stream
-from cdpipe.core.motion import Motion, make_motion
+from cdpipe.core.geometry.motion import Motion, make_motion
 from scenarios.schema import Platform, Scenario
 from sim.drive.path import Path
 from sim.geometry.line import smooth_between, smooth_line

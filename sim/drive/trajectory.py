@@ -9,7 +9,7 @@ import numpy as np
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
-from cdpipe.core.motion import Motion, rotation_matrices
+from cdpipe.core.geometry.motion import Motion, rotation_matrices
 from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios.schema import Platform, Scenario
 from sim.drive.obstacles import check_clearance

@@ -11,11 +11,12 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import invert, transform
+from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.io.session import ScanChunk, SessionWriter, fit_chunk
 from scenarios.grafted import GraftScenario
 from sim.graft.casting import Grafted, graft_revolution
 from sim.graft.part import Part, RecordedRevolution
-from sim.graft.plan import Graft, Progress, Recorded, plan_graft
+from sim.graft.plan import Graft, Recorded, plan_graft
 from sim.session.labels import mark_belonging
 from sim.session.simulate import HeldPair, HeldSession, LabelledSession
 from sim.session.truth import Int16Array, PairTruth, write_labels, write_pair_truth, write_true_poses
@@ -42,7 +43,7 @@ def graft_pair(
     recorded: Recorded,
     files: Mapping[str, str],
     out: Path,
-    report: Progress = lambda stage, done, total: None,
+    report: Progress = report_nothing,
 ) -> PairTruth:
     """Write `before`, `after` and `truth` of a grafted pair into an empty folder, as `simulate_pair` does.
 
@@ -76,7 +77,7 @@ def graft_in_memory(scenario: GraftScenario, seed: int, recorded: Recorded, file
     Raises:
         InputError, ScenarioError: As `graft_pair`.
     """
-    graft = plan_graft(scenario, seed, recorded, lambda stage, done, total: None)
+    graft = plan_graft(scenario, seed, recorded, report_nothing)
     counts = [Counts(), Counts()]
     sessions = {part.name: _hold_session(graft, number, counts[number]) for number, part in enumerate(graft.parts)}
     return HeldPair(collect_truth(graft, files, counts), sessions)

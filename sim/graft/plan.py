@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array, Int32Array
+from cdpipe.core.progress import Progress
 from cdpipe.io.session import Session
 from scenarios.grafted import GraftScenario
 from sim.geometry.mesh import Mesh
@@ -24,7 +25,6 @@ from sim.placement.placing import Standing
 from sim.session.labels import Tally, list_changes
 from sim.session.truth import SESSIONS, SessionName
 
-Progress = Callable[[str, int, int], None]
 ONE_RECORDING = "one recording"
 
 

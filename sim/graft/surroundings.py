@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform, travelled_m
-from cdpipe.core.voxel import thin
+from cdpipe.core.geometry.voxel import thin
 from sim.graft.part import Part, world_points
 
 _CELL_M = 0.07  # one return of each cell is kept

@@ -10,7 +10,7 @@ import numpy as np
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, stream, transform
-from cdpipe.core.motion import Motion
+from cdpipe.core.geometry.motion import Motion
 from scenarios.schema import Mover, Scenario
 from sim.movers.course import Course, stay
 from sim.movers.kinds import build_body

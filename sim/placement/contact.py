@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, transform
-from cdpipe.core.voxel import thin
+from cdpipe.core.geometry.voxel import thin
 from sim.geometry.mesh import Mesh, join_meshes, move_mesh, split_triangles
 from sim.geometry.raycast import Caster
 from sim.placement.placing import Standing, standing_points

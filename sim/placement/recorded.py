@@ -11,7 +11,7 @@ import numpy as np
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array
-from cdpipe.core.motion import Motion
+from cdpipe.core.geometry.motion import Motion
 from cdpipe.io.tum import motion_through, read_trajectory
 from sim.geometry.raycast import Caster, measure_room
 

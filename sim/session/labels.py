@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
-from cdpipe.core.voxel import cell_keys
+from cdpipe.core.geometry.voxel import cell_keys
 from scenarios.schema import Scenario
 from sim.geometry.mesh import Mesh, NearSurface, crop_near, drop_unused_vertices, join_meshes, split_triangles
 from sim.geometry.raycast import Caster

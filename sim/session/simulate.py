@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -19,6 +19,7 @@ import numpy.typing as npt
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float32Array, Float64Array
 from cdpipe.core.plugins import extra_version, require_extra
+from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.core.spooled import SpooledArray
 from cdpipe.core.yamlfile import setting_lines
 from cdpipe.io.session import CHUNK_SCANS, ScanChunk, Session, SessionWriter, fit_chunk
@@ -45,8 +46,6 @@ from sim.session.truth import (
 THREADS = 2
 # Bytes of each channel of a session that are held in memory until KISS-ICP has its poses; more are in a temporary file.
 _HELD_BYTES = 1 << 25
-
-Progress = Callable[[str, int, int], None]
 
 
 def simulate(
@@ -96,7 +95,7 @@ def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progres
             KISS-ICP is asked for and not installed.
         ScenarioError: The world contradicts itself.
     """
-    report = on_progress or _report_nothing
+    report = on_progress or report_nothing
     if (out.exists() or out.is_symlink()) and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(f"{out}: exists and is not an empty folder: name a new one or remove it")
     drives, files = _plan(scenario, seed, report)
@@ -142,10 +141,6 @@ def track_movers(drive: Drive) -> MoverTrack | None:
         return None
     poses = np.stack([mover.world_T_root(drive.trajectory.revolution_s) for mover in drive.moving.movers])
     return MoverTrack(poses, drive.sightings[..., 0].astype(np.int32), drive.sightings[..., 1:])
-
-
-def _report_nothing(stage: str, done: int, total: int) -> None:
-    pass
 
 
 def _plan(scenario: Scenario, seed: int, report: Progress) -> tuple[list[Drive], dict[str, str]]:
@@ -332,7 +327,7 @@ def simulate_in_memory(scenario: Scenario, seed: int, n_threads: int = 1) -> Hel
             installed.
         ScenarioError: The world contradicts itself.
     """
-    drives, files = _plan(scenario, seed, _report_nothing)
+    drives, files = _plan(scenario, seed, report_nothing)
     with ThreadPoolExecutor(min(n_threads, os.cpu_count() or 1)) as pool:
         sessions = {drive.name: hold_session(drive, pool) for drive in drives}
     return HeldPair(collect_truth(scenario, seed, drives, files), sessions)
@@ -341,7 +336,7 @@ def simulate_in_memory(scenario: Scenario, seed: int, n_threads: int = 1) -> Hel
 def hold_session(drive: Drive, pool: Executor) -> LabelledSession:
     """Simulate one session with its truth into memory, the revolutions in the threads of `pool`."""
     with closing(_simulate_revolutions(drive, pool)) as revolutions:
-        drive, kept = _estimate_odometry(drive, revolutions, _report_nothing)
+        drive, kept = _estimate_odometry(drive, revolutions, report_nothing)
         chunk, instance, change, surface = zip(*_fill_chunks(drive, kept), strict=True)
     session = HeldSession(
         Path(drive.name),

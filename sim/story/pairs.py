@@ -14,13 +14,14 @@ from pydantic import ValidationError
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import require_plain_file
+from cdpipe.core.progress import Progress, report_nothing
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
 from sim.scene import Ground, World, lay_ground
 from sim.session.labels import list_changes
 from sim.session.planning import PlannedSession, pair_drives
 from sim.session.revolution import Drive
-from sim.session.simulate import THREADS, Progress, collect_truth, write_session
+from sim.session.simulate import THREADS, collect_truth, write_session
 from sim.session.truth import SESSIONS, PairTruth, write_pair_truth
 from sim.story.simulate import list_sessions_files, refuse_unsuited
 from sim.story.state import SessionState, Story, find_mistakes, read_story
@@ -62,7 +63,7 @@ class PairMaker:
                 version, or nothing can be written.
         """
         states = self._choose(before, after)
-        report = on_progress or _report_nothing
+        report = on_progress or report_nothing
         report("world", 0, 1)
         paired, drives = self._plan(states)
         report("world", 1, 1)
@@ -159,7 +160,3 @@ def _link_files(stored: Path, made: Path) -> None:
         except OSError:  # another file system, or one without links: the copy stays
             continue
         link.replace(made / name)
-
-
-def _report_nothing(stage: str, done: int, total: int) -> None:
-    pass

@@ -14,11 +14,12 @@ import numpy as np
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.core.plugins import require_extra
+from cdpipe.core.progress import Progress, report_nothing
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
 from sim.scene import lay_ground
 from sim.session.planning import PlannedSession, make_drive
-from sim.session.simulate import THREADS, Progress, write_session
+from sim.session.simulate import THREADS, write_session
 from sim.story.schedule import draw_states
 from sim.story.state import FEWEST, MOST, Story, dump_story
 from sim.story.world import build_session_world, plan_session
@@ -47,7 +48,7 @@ def simulate_story(
     if not FEWEST <= n_sessions <= MOST:
         raise InputError(f"n_sessions = {n_sessions}: a story has {FEWEST} to {MOST} sessions")
     refuse_unsuited(scenario)
-    report = on_progress or _report_nothing
+    report = on_progress or report_nothing
     files = file_digests(scenario)
     report("world", 0, 1)
     ground = lay_ground(scenario, seed)
@@ -129,7 +130,3 @@ def _refuse_moved_curtains(planned: PlannedSession, curtains: dict[str, Float64A
                 f"{planned.own_name}: mover {body.mover.name!r}: the curtain finds no way where it hung before, and a "
                 "curtain that hangs elsewhere is a change: give its path between, fractions and lateral"
             )
-
-
-def _report_nothing(stage: str, done: int, total: int) -> None:
-    pass

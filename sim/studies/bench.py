@@ -17,6 +17,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from cdpipe.core.geometry import Float64Array, Int32Array, stream, yaw_pose
+from cdpipe.core.progress import report_nothing
 from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios.library import load_scenario
 from scenarios.schema import Prop, PropKind, Scenario
@@ -226,7 +227,7 @@ def time_session(site: BenchSite, drive: Drive, target: float) -> Contest:
     names = count()
     with TemporaryDirectory() as folder, ThreadPoolExecutor(THREADS) as pool:
         seconds = timed(
-            lambda: write_session(drive, Path(folder) / str(next(names)), pool, lambda stage, done, total: None),
+            lambda: write_session(drive, Path(folder) / str(next(names)), pool, report_nothing),
             site.few,
         )
     n_scans = drive.trajectory.n_scans

@@ -14,35 +14,25 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from cdpipe.core.geometry import Float32Array, Float64Array, make_pose, yaw_pose
+from cdpipe.core.geometry import Float32Array, Float64Array, yaw_pose
 from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios.schema import Sensor
-from sim.geometry.mesh import Mesh, box_mesh, move_mesh
+from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
-from sim.materials import REFLECTIVITY
-from sim.scene import Scene
-from sim.sensor.air import AIR, AirVolume
 from sim.sensor.footprint import central_echo, spread_echo
-from sim.sensor.glare import GLARE
-from sim.sensor.glass import ABSORBED, GLASS_INDEX, Panes
-from sim.sensor.lidar import FALSE_RETURN, Scan, scan
+from sim.sensor.lidar import FALSE_RETURN, scan
 from sim.sensor.optics import (
     FALSE_RETURN_RATE,
-    MIRRORED,
     PHOTONS_AT_1_M,
     detection_probability,
-    mirrored_share,
     range_sigma_m,
     received_photons,
-    reflected_share,
     reflectivity_channel,
 )
 from sim.sensor.rays import Rays, revolution_rays
-from sim.sensor.water import WATER_INDEX
+from sim.studies.mine_plots import draw_air, draw_glare, draw_mirrors
+from sim.studies.sensor_rooms import COLOURS, IDEAL, SEED, make_room, still_scan
 
-SEED = 7
-_IDEAL = Sensor(range_noise=False, dropouts=False, false_positives=False)
-_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7")  # after Okabe and Ito
 _SHARES = (0.1, 0.25, 0.8)
 # Of the real unit: sigma of facing surfaces by range (m, mm), by photons between 4 and 13 m (photons, mm), and photons
 # per percent of reflectivity by range.
@@ -72,18 +62,18 @@ def _rolling(figure: Figure) -> None:
     left, right = figure.subplots(1, 2)
     time_s = np.arange(sensor.width) / sensor.width / sensor.rate_hz - 0.05
     poses = np.stack([yaw_pose(np.deg2rad(60.0) * t, (5.0 * t, 0.0, 0.0)) for t in time_s])
-    result = scan(_room((5.0, 3.0, 2.0)), sensor, _IDEAL, revolution_rays(sensor, poses), SEED, "before", 0)
+    result = scan(make_room((5.0, 3.0, 2.0)), sensor, IDEAL, revolution_rays(sensor, poses), SEED, "before", 0)
     points = sensor.project(result.range_mm / 1000.0)
     placed = np.einsum("wij,hwj->hwi", poses[:, :3, :3], points) + poses[:, :3, 3]
     row = 16
-    for cloud, colour, label in ((points, _COLOURS[1], "one pose"), (placed, _COLOURS[0], "a pose per column")):
+    for cloud, colour, label in ((points, COLOURS[1], "one pose"), (placed, COLOURS[0], "a pose per column")):
         left.plot(cloud[row, :, 0], cloud[row, :, 1], ".", markersize=2, color=colour, label=label)
     left.set(xlabel="x (m)", ylabel="y (m)", title="A 10 x 6 m room at 5 m/s and 60 deg/s", aspect="equal")
     left.legend(loc="center", markerscale=5, fontsize=8)
     for place, column in enumerate((508, 512, 516)):
         way = sensor.directions[:, column]
         azimuth, altitude = np.rad2deg(np.arctan2(way[:, 1], way[:, 0])), np.rad2deg(np.arcsin(way[:, 2]))
-        right.plot(azimuth, altitude, "o", markersize=3, color=_COLOURS[place], label=f"column {column}")
+        right.plot(azimuth, altitude, "o", markersize=3, color=COLOURS[place], label=f"column {column}")
     right.set(xlabel="azimuth (deg), counter-clockwise", ylabel="altitude (deg)", title="Beams of one time stamp each")
     right.set_xlim(-6.5, 14.0)
     right.legend(fontsize=8, loc="center right")
@@ -93,13 +83,13 @@ def _range_noise(figure: Figure) -> None:
     left, right = figure.subplots(1, 2)
     range_m = _grid(0.3, 120.0)
     level = np.ones_like(range_m)
-    for share, colour in zip(_SHARES, _COLOURS, strict=False):
+    for share, colour in zip(_SHARES, COLOURS, strict=False):
         sigma = range_sigma_m(range_m, received_photons(share * level, range_m), level)
         left.loglog(range_m, 1000 * sigma, color=colour, label=f"{100 * share:.0f} %, squarely")
     near_m = range_m[range_m < 25.0]
     slanted: Float32Array = np.full(len(near_m), 0.26, np.float32)  # 75 degrees
     sigma = range_sigma_m(near_m, received_photons(np.float32(0.25) * slanted, near_m), slanted)
-    left.loglog(near_m, 1000 * sigma, "--", color=_COLOURS[1], label="25 % at 75 deg")
+    left.loglog(near_m, 1000 * sigma, "--", color=COLOURS[1], label="25 % at 75 deg")
     left.step((0.3, 1, 20, 50, 120), (7, 7, 10, 20, 50), where="pre", color="grey", linewidth=1, label="quoted table")
     left.plot(*_REAL_SIGMA, "kx", label="real unit, facing")
     left.set(xlabel="range (m)", ylabel="sigma of the range (mm)", title="By range")
@@ -107,7 +97,7 @@ def _range_noise(figure: Figure) -> None:
     left.yaxis.set_minor_formatter("")
     left.legend(fontsize=7)
     light = _grid(2.0, 1000.0)
-    for reach_m, colour in zip((8.0, 20.0, 50.0), _COLOURS, strict=False):
+    for reach_m, colour in zip((8.0, 20.0, 50.0), COLOURS, strict=False):
         right.semilogx(light, 1000 * range_sigma_m(reach_m * level, light, level), color=colour, label=f"{reach_m:g} m")
     right.plot(*_REAL_BY_LIGHT, "kx", label="real unit, 4-13 m")
     right.set(xlabel="photons", ylabel="sigma of the range (mm)", title="By strength, squarely", ylim=(0, 33))
@@ -119,7 +109,7 @@ def _detection(figure: Figure) -> None:
     sensor = load_profile("os1-32-nominal", "1024x10")
     range_m = _grid(5.0, 200.0)
     settings = Sensor(range_noise=False, false_positives=False)
-    for share, colour in zip(_SHARES, _COLOURS, strict=False):
+    for share, colour in zip(_SHARES, COLOURS, strict=False):
         seen = detection_probability(received_photons(share * np.ones_like(range_m), range_m))
         axes.plot(range_m, 100 * seen, color=colour, label=f"{100 * share:.0f} % target, met squarely")
         walls_m = np.arange(20.0, 120.0, 10.0)
@@ -136,16 +126,16 @@ def _incidence(figure: Figure) -> None:
     left, right = figure.subplots(1, 2)
     angle = np.linspace(0.0, 89.9, 400).astype(np.float32)
     cosine = np.cos(np.deg2rad(angle))
-    for reach_m, colour in zip((3.0, 8.0, 15.0, 30.0), _COLOURS, strict=True):
+    for reach_m, colour in zip((3.0, 8.0, 15.0, 30.0), COLOURS, strict=True):
         seen = detection_probability(received_photons(np.float32(0.25) * cosine, np.full_like(angle, reach_m)))
         left.plot(angle, 100 * seen, color=colour, label=f"{reach_m:g} m")
     left.set(xlabel="incidence (deg)", ylabel="returns (%)", title="Rock of 25 %", xlim=(60, 90))
     left.legend(fontsize=8)
     sensor = load_profile("os1-32-nominal", "1024x10")
     settings = Sensor(range_noise=False, false_positives=False)
-    for share, colour in zip((0.06, 0.25), _COLOURS, strict=False):
-        scene = _room((80.0, 80.0, 0.8 - sensor.sensor_T_lidar[2, 3]), share)
-        seen = np.mean([_still_scan(scene, sensor, settings, n).range_mm > 0 for n in range(8)], axis=(0, 2))
+    for share, colour in zip((0.06, 0.25), COLOURS, strict=False):
+        scene = make_room((80.0, 80.0, 0.8 - sensor.sensor_T_lidar[2, 3]), share)
+        seen = np.mean([still_scan(scene, sensor, settings, n).range_mm > 0 for n in range(8)], axis=(0, 2))
         down = sensor.altitude_deg < 0
         beams_m = 0.8 / np.sin(np.deg2rad(-sensor.altitude_deg[down]))
         right.plot(beams_m, 100 * seen[down], "o", markersize=4, color=colour, label=f"{100 * share:.0f} % floor")
@@ -159,7 +149,7 @@ def _incidence(figure: Figure) -> None:
 def _channels(figure: Figure) -> None:
     left, right = figure.subplots(1, 2)
     range_m = _grid(0.3, 120.0)
-    for share, colour in zip(_SHARES, _COLOURS, strict=False):
+    for share, colour in zip(_SHARES, COLOURS, strict=False):
         light = received_photons(share * np.ones_like(range_m), range_m)
         left.loglog(range_m, light, color=colour, label=f"{100 * share:.0f} %")
     far_m = _grid(4.0, 120.0)
@@ -168,7 +158,7 @@ def _channels(figure: Figure) -> None:
     left.set(xlabel="range (m)", ylabel="photons", title="Signal, met squarely", ylim=(1, 3000))
     left.legend(fontsize=7)
     bright = _grid(0.01, 100.0)
-    right.semilogx(100 * bright, reflectivity_channel(bright), color=_COLOURS[0])
+    right.semilogx(100 * bright, reflectivity_channel(bright), color=COLOURS[0])
     right.axvline(100.0, color="grey", linewidth=0.8, linestyle=":")
     right.text(125.0, 20.0, "logarithmic; of our materials\nretroreflectors alone", fontsize=8, color="grey")
     right.set(xlabel="reflectivity x cosine (%)", ylabel="reflectivity channel", title="Calibrated reflectivity")
@@ -181,7 +171,7 @@ def _divergence(figure: Figure) -> None:
         rays = _fan(np.arange(-0.09, 0.0901, 0.0003))
         seen = Caster(meshes), np.full(2, 0.25, np.float32), rays, 0.0, np.arange(2, dtype=np.int32)
         every = {1: central_echo(*seen), 19: spread_echo(*seen, 19)}
-        for (count, echo), colour, size in zip(every.items(), _COLOURS, (5, 2), strict=False):
+        for (count, echo), colour, size in zip(every.items(), COLOURS, (5, 2), strict=False):
             points = echo.range_m[..., None] * rays.directions
             axes.plot(points[:, 0, 1], points[:, 0, 0], ".", markersize=size, color=colour, label=f"{count} per beam")
         axes.set(xlabel="y (m)", title=f"Edge {depth_m:g} m before a wall, from above", xlim=(-0.12, 0.12))
@@ -192,9 +182,9 @@ def _divergence(figure: Figure) -> None:
 def _false_returns(figure: Figure) -> None:
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     sensor = load_profile("os1-32-nominal", "1024x10")
-    scene, drawn = _room((40.0, 2.5, 2.0), 0.25), []
+    scene, drawn = make_room((40.0, 2.5, 2.0), 0.25), []
     for number in range(40):
-        result = _still_scan(scene, sensor, Sensor(), number)
+        result = still_scan(scene, sensor, Sensor(), number)
         points = sensor.project(result.range_mm / 1000.0)
         is_false = result.geom == FALSE_RETURN
         drawn.append(result.range_mm[is_false] / 1000.0)
@@ -202,11 +192,11 @@ def _false_returns(figure: Figure) -> None:
             wall = points[(result.geom >= 0) & (np.abs(sensor.altitude_deg) < 4)[:, None]]
             left.plot(wall[:, 0], wall[:, 1], ".", markersize=1, color="grey", label="walls, one revolution")
         lone = points[is_false]
-        left.plot(lone[:, 0], lone[:, 1], "x", markersize=4, color=_COLOURS[1], label=None if number else "false")
+        left.plot(lone[:, 0], lone[:, 1], "x", markersize=4, color=COLOURS[1], label=None if number else "false")
     left.set(xlabel="x (m)", ylabel="y (m)", title="From above, false returns of 40 revolutions", aspect="equal")
     left.legend(fontsize=7, loc="lower left", framealpha=1.0)
     ranges_m = np.concatenate(drawn)
-    right.hist(ranges_m, bins=12, range=(0.0, 120.0), color=_COLOURS[1], edgecolor="white")
+    right.hist(ranges_m, bins=12, range=(0.0, 120.0), color=COLOURS[1], edgecolor="white")
     expected = 40 * sensor.height * sensor.width * FALSE_RETURN_RATE
     right.axhline(expected * 10.0 / (Sensor().max_range_m - Sensor().min_range_m), color="k", linewidth=0.8)
     title = f"{len(ranges_m)} in 40; line: expected {expected:.0f}"
@@ -217,126 +207,28 @@ def _steps(figure: Figure) -> None:
     left, right = figure.subplots(1, 2)
     sensor = load_profile("os1-32-nominal", "2048x10")
     row = 15
-    scene = _room((3.0, 0.35, 1.0))
-    for step_mm, colour, size in ((1, _COLOURS[0], 2), (8, _COLOURS[1], 5)):
-        result = _still_scan(scene, sensor, Sensor(**(_IDEAL.model_dump() | {"range_step_mm": step_mm})), 0)
+    scene = make_room((3.0, 0.35, 1.0))
+    for step_mm, colour, size in ((1, COLOURS[0], 2), (8, COLOURS[1], 5)):
+        result = still_scan(scene, sensor, Sensor(**(IDEAL.model_dump() | {"range_step_mm": step_mm})), 0)
         pair = (1000 * result.true_range_m[row], result.range_mm[row])
         left.plot(*pair, ".", markersize=size, color=colour, label=f"{step_mm} mm")
     left.set(xlabel="true range (mm)", ylabel="reported range (mm)", title="Range steps", xlim=(350, 410))
     left.set_ylim(340, 410)
     left.legend(fontsize=8)
-    narrow = _still_scan(_room((3.0, 0.25, 1.0)), sensor, _IDEAL, 0)
+    narrow = still_scan(make_room((3.0, 0.25, 1.0)), sensor, IDEAL, 0)
     is_hit = narrow.range_mm[row] > 0
     columns = np.arange(sensor.width)
-    right.plot(columns[is_hit], narrow.range_mm[row, is_hit] / 1000.0, ".", markersize=2, color=_COLOURS[0])
-    right.plot(columns[~is_hit], narrow.true_range_m[row, ~is_hit], ".", markersize=2, color=_COLOURS[1])
+    right.plot(columns[is_hit], narrow.range_mm[row, is_hit] / 1000.0, ".", markersize=2, color=COLOURS[0])
+    right.plot(columns[~is_hit], narrow.true_range_m[row, ~is_hit], ".", markersize=2, color=COLOURS[1])
     right.axhline(0.3, color="grey", linewidth=0.8, linestyle=":")
     right.text(240, 0.66, "orange: nearer\nthan 0.3 m,\na miss", fontsize=8)
     right.set(xlabel="column", ylabel="range (m)", title="Walls 0.25 m to either side", ylim=(0.2, 1.0))
 
 
-def _air(figure: Figure) -> None:
-    left, right = figure.subplots(1, 2)
-    sensor = load_profile("os1-32-nominal", "1024x10")
-    scene = _room((30.0, 2.5, 2.0))
-    clear = _still_scan(scene, sensor, _IDEAL, 0)
-    for visibility_m, colour in zip((12.0, 30.0, 60.0), _COLOURS, strict=False):
-        misty = [_still_scan(scene, sensor, _IDEAL, n, AirVolume(np.log(20) / visibility_m)) for n in range(4)]
-        is_wall = (misty[0].geom >= 0) & (clear.signal >= 20)
-        reach_m = (clear.true_range_m - sensor.beam_origin_m)[is_wall]
-        left.plot(reach_m[::7], (misty[0].signal / clear.signal.clip(1))[is_wall][::7], ".", markersize=2, color=colour)
-        line_m = np.linspace(0.0, 20.0, 100)
-        left.plot(line_m, np.exp(-2 * np.log(20) / visibility_m * line_m), color=colour, label=f"{visibility_m:g} m")
-        ranges_m = np.concatenate([each.range_mm[each.geom == AIR] / 1000.0 for each in misty])
-        share = len(ranges_m) / (4 * sensor.height * sensor.width)
-        label = f"{visibility_m:g} m: {100 * share:.0f} % of the beams"
-        right.hist(ranges_m, bins=40, range=(0.0, 20.0), histtype="step", color=colour, label=label)
-    left.set(xlabel="way to the wall (m)", ylabel="share of the photons", title="Lines: Beer-Lambert; dots: simulated")
-    left.legend(fontsize=8, title="visibility", title_fontsize=8)
-    right.set(xlabel="range (m)", ylabel="returns per 0.5 m", title="Returns of the mist in a 5 m drift", yscale="log")
-    right.legend(fontsize=8)
-
-
-def _mirrors(figure: Figure) -> None:
-    left, right = figure.subplots(1, 2)
-    angles_deg = np.linspace(0.0, 89.9, 300)
-    cosine = np.cos(np.deg2rad(angles_deg))
-    for (name, index), colour in zip({"water": WATER_INDEX, "glass": GLASS_INDEX}.items(), _COLOURS, strict=False):
-        left.plot(angles_deg, mirrored_share(cosine, index), color=colour, label=f"{name}, mirrored")
-    passed = (1.0 - mirrored_share(cosine, GLASS_INDEX)) ** 2 * (1.0 - ABSORBED)
-    left.plot(angles_deg, passed, "--", color=_COLOURS[1], label="pane, let through")
-    left.set(xlabel="incidence (deg)", ylabel="share of the light", title="Fresnel; each way")
-    left.legend(fontsize=8)
-    sensor, hall = load_profile("os1-32-nominal", "2048x10"), box_mesh((9.0, 6.0, 2.0))
-    pane = move_mesh(box_mesh((2.5, 0.003, 1.5)), yaw_pose(0.2, (3.5, 1.4, 0.0)))
-    meshes = Mesh(hall.vertices, hall.faces[:, ::-1]), pane
-    shares, owners = np.array([0.25, 0.05], np.float32), np.array([0, 1], np.int32)
-    scene = Scene(meshes, Caster(meshes), owners, shares, ("wall", "pane"), ("rock", "glass"))
-    panes, both = (
-        Panes(scene.caster, shares, owners, owners == 1),
-        Sensor(**(_IDEAL.model_dump() | {"returns": "dual"})),
-    )
-    rays = revolution_rays(sensor, np.tile(make_pose(), (sensor.width, 1, 1)))
-    result = scan(scene, sensor, both, rays, SEED, "before", 0, panes=panes)
-    points = sensor.project(result.range_mm / 1000.0)
-    level = np.tile(np.abs(sensor.altitude_deg) < 1.0, 2)[:, None] & (result.range_mm > 0)
-    for told, geom, colour in (("walls", 0, "grey"), ("pane", 1, _COLOURS[2]), ("mirrored", MIRRORED, _COLOURS[1])):
-        shown = points[level & (result.geom == geom)]
-        right.plot(shown[:, 0], shown[:, 1], ".", markersize=2, color=colour, label=told)
-    right.set(xlabel="x (m)", ylabel="y (m)", title="A pane of 5 m, both returns", aspect="equal")
-    right.legend(fontsize=7, loc="lower right", framealpha=1.0)
-
-
-def _glare(figure: Figure) -> None:
-    left, right = figure.subplots(1, 2)
-    angles_deg = np.linspace(0.0, 75.0, 300)
-    cosine, shares = (
-        np.cos(np.deg2rad(angles_deg)).astype(np.float32),
-        np.array([REFLECTIVITY["reflector"]], np.float32),
-    )
-    left.plot(
-        angles_deg, reflected_share(shares, np.zeros(300, np.int32), cosine), color=_COLOURS[1], label="reflector"
-    )
-    left.plot(angles_deg, cosine, color="grey", label="white")
-    left.set(xlabel="incidence (deg)", ylabel="light, of white at right angles", title="A retroreflector", yscale="log")
-    left.legend(fontsize=8)
-    sensor, hall, plate = (
-        load_profile("os1-32-nominal", "1024x10"),
-        box_mesh((12.0, 12.0, 4.0)),
-        box_mesh((0.01, 0.2, 0.2)),
-    )
-    meshes = Mesh(hall.vertices, hall.faces[:, ::-1]), Mesh(plate.vertices + np.array([6.0, 0.0, 0.0]), plate.faces)
-    reflectivity = np.array([0.25, REFLECTIVITY["reflector"]], np.float32)
-    scene = Scene(meshes, Caster(meshes), np.array([0, 1], np.int32), reflectivity, ("wall",), ("rock",))
-    result = _still_scan(scene, sensor, Sensor(**(_IDEAL.model_dump() | {"retroreflectors": True, "sub_rays": 7})), 0)
-    ways = sensor.directions
-    azimuth_deg, altitude_deg = np.rad2deg(np.arctan2(ways[..., 1], ways[..., 0])), np.rad2deg(np.arcsin(ways[..., 2]))
-    near = (np.abs(azimuth_deg) < 8.0) & (np.abs(altitude_deg) < 8.0)
-    kinds = (("wall", 0, "grey"), ("plate", 1, _COLOURS[1]), ("nothing", -1, _COLOURS[0]), ("glare", GLARE, "k"))
-    for told, geom, colour in kinds:
-        shown = near & (result.geom == geom)
-        right.plot(azimuth_deg[shown], altitude_deg[shown], ".", markersize=5, color=colour, label=told)
-    right.set(xlabel="azimuth (deg)", ylabel="altitude (deg)", title="Beams around a plate at 6 m")
-    right.legend(fontsize=8, loc="upper right", framealpha=1.0)
-
-
 def _facing_share(sensor: SensorMetadata, settings: Sensor, share: float, wall_m: float) -> float:
     """Return the share of beams within 5 degrees of the normal of a wall that have a return."""
-    result = _still_scan(_room((wall_m, 150.0, 150.0), share), sensor, settings, int(wall_m))
+    result = still_scan(make_room((wall_m, 150.0, 150.0), share), sensor, settings, int(wall_m))
     return float((result.range_mm > 0)[np.abs(sensor.directions[..., 0]) > np.cos(np.deg2rad(5.0))].mean())
-
-
-def _still_scan(
-    scene: Scene, sensor: SensorMetadata, settings: Sensor, number: int, air: AirVolume | None = None
-) -> Scan:
-    rays = revolution_rays(sensor, np.tile(make_pose(), (sensor.width, 1, 1)))
-    return scan(scene, sensor, settings, rays, SEED, "before", number, air=air)
-
-
-def _room(half_m: tuple[float, float, float], reflectivity: float = 0.25) -> Scene:
-    mesh = Mesh(box_mesh(half_m).vertices, box_mesh(half_m).faces[:, ::-1])
-    share = np.array([reflectivity], np.float32)
-    return Scene((mesh,), Caster([mesh]), np.zeros(1, np.int32), share, ("wall",), ("rock",))
 
 
 def _plate(x_m: float, low_m: float, high_m: float) -> Mesh:
@@ -362,9 +254,9 @@ _PLOTS: dict[str, Callable[[Figure], None]] = {
     "divergence": _divergence,
     "false_returns": _false_returns,
     "steps": _steps,
-    "air": _air,
-    "mirrors": _mirrors,
-    "glare": _glare,
+    "air": draw_air,
+    "mirrors": draw_mirrors,
+    "glare": draw_glare,
 }
 
 if __name__ == "__main__":

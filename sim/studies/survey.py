@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,6 +16,7 @@ from pydantic import TypeAdapter
 from cdpipe.core.errors import InputError, TunnelcdError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.core.isolation import ProcessDiedError, run_isolated
+from cdpipe.core.progress import Progress, report_nothing
 from scenarios.library import load_scenario
 from sim.drive.trajectory import load_sensor, plan_trajectory
 from sim.geometry.raycast import Caster
@@ -31,7 +32,6 @@ from sim.studies.contour import contour_roughness
 _KEYFRAME_M = 1.0
 _FIT_M = 8.0  # longer features along a drift of a foreign mesh belong to its section
 
-Progress = Callable[[str, int, int], None]
 _KINDS = ("added", "removed", "moved", "reshaped")
 
 
@@ -117,7 +117,7 @@ def survey(family: str, seeds: Sequence[int], workers: int = 1, on_progress: Pro
     Raises:
         ScenarioError: The scenario is unknown, or its file has mistakes.
     """
-    report = on_progress or (lambda label, done, total: None)
+    report = on_progress or report_nothing
     load_scenario(family, seeds[0])  # mistakes in the file concern all seeds
     report(family, 0, len(seeds))
     found: dict[int, WorldFigures | Failure] = {}

@@ -13,6 +13,7 @@ import yaml
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.names import visible
+from cdpipe.core.progress import Progress, report_nothing
 from scenarios.schema import Scenario
 from sim.drive.trajectory import load_sensor, plan_trajectory
 from sim.geometry.raycast import Caster
@@ -22,7 +23,7 @@ from sim.rock.grounding import set_on_floor
 from sim.scene import build_world
 from sim.trace.route import find_route
 from sim.trace.spots import BoxSpot, find_spots
-from sim.trace.tracing import Progress, Trace
+from sim.trace.tracing import Trace
 
 _ROUTE_M = 200.0  # a pair of 200 m is simulated in a minute or two
 _DRIVABLE_SLOPE = 0.36  # 20 degrees; on steeper floors a quadrotor flies
@@ -61,7 +62,7 @@ def draft_scenario(found: Trace, on_progress: Progress | None = None) -> Draft:
         found: The traced drifts.
         on_progress: Receives "drive it", the number of the try and the number of tries.
     """
-    tell = on_progress or (lambda _name, _done, _total: None)
+    tell = on_progress or report_nothing
     centreline = build_centreline(found.tunnel, 0)
     route = find_route(centreline, _ROUTE_M)
     first, trouble = None, ""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array
+from cdpipe.core.progress import Progress, report_nothing
 from scenarios.schema import Drift, MeshFile, Section, Tunnel
 from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
@@ -32,7 +33,6 @@ _PART_WIDTHS = 3.0  # a part shorter than this is a bubble
 _TOLERANCES = (0.12, 0.06, 0.03)  # of the width, of the straight lines between nodes
 _ASIDE = 0.2  # of the width, that the line of the simulator may lie beside the traced one
 _ALIKE = 0.1  # sections that differ by less are one
-Progress = Callable[[str, int, int], None]
 Nodes = dict[str, tuple[float, float, float]]
 
 
@@ -79,7 +79,7 @@ def trace_mesh(
     Raises:
         ScenarioError: The file cannot be read, or holds no tunnel that can be traced; one line with the way out.
     """
-    tell = on_progress or (lambda _name, _done, _total: None)
+    tell = on_progress or report_nothing
     tell("read the mesh", 0, 4)
     walls = _read_walls(file)
     notes = judge_width(walls.width_m, walls.file, is_sure_of_units)

@@ -17,7 +17,13 @@ import psutil
 # One process imports once and forks for each command, so that a command starts at once.
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(
-    ["eval.cli.main", "eval.running.runner", "eval.report.page", "eval.training.training_run", "cdpipe.pipeline"]
+    [
+        "eval.cli.main",
+        "eval.running.runner",
+        "eval.report.page",
+        "eval.training.training_run",
+        "cdpipe.pipeline.detection",
+    ]
 )
 _FIRST_WORD = {2: "error: ", 130: "interrupted"}
 

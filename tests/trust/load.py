@@ -32,7 +32,8 @@ from cdpipe.io.answer import Answer
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 from eval.bench.corridor import CorridorScans
 from eval.bench.meter import StageMeter, peak_mb
-from eval.plans.plan import expand_cells, load_plan
+from eval.plans.cells import expand_cells
+from eval.plans.plan import load_plan
 from eval.plans.worlds import list_worlds
 from eval.running.pair_run import CellKeys
 from eval.running.runfolder import RunFolder, write_json

@@ -42,17 +42,18 @@ from cdpipe.training.shard import FIELDS, FORMAT, FORMAT_VERSION, encode_shard, 
 from cdpipe.training.sphere_training import read_sphere_data
 from eval.leaderboard.page import write_leaderboard
 from eval.leaderboard.submission import pack_submission, read_submission
-from eval.plans.plan import expand_cells, load_plan
+from eval.plans.cells import expand_cells
+from eval.plans.plan import load_plan
 from eval.release.archive import pack, unpack_release, write_sums
 from eval.report.comparison import compare_sides
 from eval.report.page import write_page
 from eval.running.cell_file import LAST, NO_KEY, cell_document
 from eval.running.export import name_blindly
 from eval.running.rescoring import foreign_identity
-from eval.running.run_data import read_run
+from eval.running.results.run_data import read_run
+from eval.running.results.sides import read_side
 from eval.running.runfolder import RunFolder, open_run_folder, write_json, write_tables
-from eval.running.sides import read_side
-from eval.running.stage_cache import Kept, StageCache
+from eval.running.stages.stage_cache import Kept, StageCache
 from eval.scoring.scoring import score_stored
 from eval.studies.calibrate import read_table
 from eval.studies.descriptors.curves import read_rows
@@ -551,7 +552,7 @@ def _read_plys(folder: Path) -> None:
 
 
 _PRESETS = tuple(f"cdpipe/methods/presets/{name}.yaml" for name in ("tunnelcd", "paper", "voxel-diff"))
-_PLANS = tuple(f"eval/plans/{name}.yaml" for name in ("smoke", "regions", "merge"))
+_PLANS = tuple(f"eval/plans/shipped/{name}.yaml" for name in ("smoke", "regions", "merge"))
 _FAMILIES = tuple(f"scenarios/families/{name}.yaml" for name in ("smoke/one_box", "network", "paper/site1"))
 
 

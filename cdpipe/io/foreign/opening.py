@@ -6,7 +6,7 @@ import hashlib
 import shutil
 import tempfile
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,8 +17,9 @@ import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
-from cdpipe.core.motion import Motion
+from cdpipe.core.geometry.motion import Motion
 from cdpipe.core.plugins import require_extra
+from cdpipe.core.progress import Progress
 from cdpipe.io.foreign.clouds import Clouds, point_times
 from cdpipe.io.foreign.folders import E57Scans, open_folder
 from cdpipe.io.foreign.points_files import cloud_reader
@@ -28,13 +29,12 @@ from cdpipe.io.foreign.trajectory import Trajectory, poses_at, read_poses, requi
 from cdpipe.io.foreign.whole_map import MapStations
 from cdpipe.io.ply import write_ply_points
 from cdpipe.io.tum import write_tum
-from cdpipe.mapping.odometry import ODOMETRIES, estimate_cloud_motion
-from cdpipe.mapping.pose_check import check_quaternion_order
+from cdpipe.mapping.poses.odometry import ODOMETRIES, estimate_cloud_motion
+from cdpipe.mapping.poses.pose_check import check_quaternion_order
 from cdpipe.model.types import PosedScan
 
 KISS_ICP = "kiss-icp"
 # Called with the stage, the number of finished scans, and their (estimated) total.
-Progress = Callable[[str, int, int], None]
 _NOMINAL_S = 0.1  # between scans that have no times
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.geometry import Float64Array, Int64Array, invert
-from cdpipe.core.motion import Motion
+from cdpipe.core.geometry.motion import Motion
 from cdpipe.io.foreign.clouds import Cloud, Clouds, point_times
 from cdpipe.model.types import PosedScan
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.files import read_bytes
 from cdpipe.core.geometry import BoolArray, Float64Array, make_pose, travelled_m
-from cdpipe.core.motion import Motion, make_motion
+from cdpipe.core.geometry.motion import Motion, make_motion
 from cdpipe.io.tum import MOST_BYTES, TUM_LINE, read_tum, require_unit_poses
 
 # A pose is rigid if no entry of R R^T is farther than this from the identity; KITTI files have six digits.

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.core.voxel import cell_means
+from cdpipe.core.geometry.voxel import cell_means
 from cdpipe.io.foreign.clouds import Cloud
 from cdpipe.io.foreign.trajectory import Trajectory
 

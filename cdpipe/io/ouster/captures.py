@@ -29,7 +29,6 @@ _LEAST_SHARE = 0.5
 # Bytes of Ethernet, IP, UDP and PCAP headers per packet, to estimate the number of packets.
 _PACKET_OVERHEAD_BYTES = 58
 # Called with the stage, the number of finished revolutions, and their (estimated) total.
-Progress = Callable[[str, int, int], None]
 _SDK_CALLS = "cdpipe.io.ouster.sdk"
 
 

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import make_pose
-from cdpipe.io.ouster.captures import Progress
+from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.io.ouster.sdk import SECOND, one_line, require_sdk
 from cdpipe.io.session import ScanChunk, Session
 
@@ -56,7 +56,7 @@ def write_osf(
     if not path.absolute().parent.is_dir():
         raise InputError(f"{path}: there is no folder {path.parent}")
     info = sensor_info(session)
-    report = on_progress or (lambda stage, done, total: None)
+    report = on_progress or report_nothing
     report("write", 0, session.n_scans)
     done = 0
     try:

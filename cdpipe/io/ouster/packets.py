@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from cdpipe.core.errors import InputError
-from cdpipe.io.ouster.captures import Progress
+from cdpipe.core.progress import Progress
 from cdpipe.io.ouster.osf import frame_of, sensor_info
 from cdpipe.io.ouster.sdk import one_line, require_sdk
 from cdpipe.io.session import Session

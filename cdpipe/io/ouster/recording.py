@@ -23,14 +23,15 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, make_pose, require_poses
-from cdpipe.core.motion import Motion, make_motion
+from cdpipe.core.geometry.motion import Motion, make_motion
 from cdpipe.core.plugins import require_extra
+from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.io.foreign.trajectory import read_poses
 from cdpipe.io.ouster.beams import check_beams
-from cdpipe.io.ouster.captures import Progress, Recording, Revolution, open_recording
+from cdpipe.io.ouster.captures import Recording, Revolution, open_recording
 from cdpipe.io.session import ScanChunk, SessionWriter, fit_chunk
 from cdpipe.io.tum import motion_along
-from cdpipe.mapping.odometry import ODOMETRIES, estimate_motion
+from cdpipe.mapping.poses.odometry import ODOMETRIES, estimate_motion
 
 KISS_ICP = "kiss-icp"
 _OWN_POSE_TOLERANCE = 1e-9
@@ -94,7 +95,7 @@ def import_recording(
         raise InputError("--trajectory and --odometry both give the poses: leave one out")
     if odometry is not None:
         require_extra(ODOMETRIES[odometry], f"--odometry {odometry}")
-    report = on_progress or (lambda stage, done, total: None)
+    report = on_progress or report_nothing
     recording = open_recording(source, metadata)
     times = _read_times(recording, report)
     motion, poses = _choose_motion(recording, times, trajectory, odometry, report)

@@ -12,9 +12,10 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array
+from cdpipe.core.progress import Progress
 from cdpipe.io.answer import Answer, read_answer
 from cdpipe.io.out.maps import PointMap, gather_map
-from cdpipe.io.out.scans import Fields, Outgoing, Progress
+from cdpipe.io.out.scans import Fields, Outgoing
 from cdpipe.mapping.mapping import choose_keyframes
 from cdpipe.model.aligned import alignment_of
 from cdpipe.model.report import ChangedObject, ChangeReport

@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from cdpipe.core.plugins import require_extra
+from cdpipe.core.progress import Progress
 from cdpipe.io.out.ros import CLOCK, CLOUD, TRANSFORMS, RosMessages
-from cdpipe.io.out.scans import Outgoing, Progress
+from cdpipe.io.out.scans import Outgoing
 
 TOPICS = {"/points": CLOUD, "/tf": TRANSFORMS, "/clock": CLOCK}
 _Write = Callable[[str, int, bytes], None]

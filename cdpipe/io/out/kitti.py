@@ -17,8 +17,9 @@ import numpy as np
 import yaml
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose
+from cdpipe.core.progress import Progress
 from cdpipe.io.out.poses import write_kitti_poses
-from cdpipe.io.out.scans import Outgoing, OutScan, Progress
+from cdpipe.io.out.scans import Outgoing, OutScan
 
 CAMERA_T_SENSOR = make_pose(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
 LABEL = "label"

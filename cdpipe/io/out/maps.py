@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.geometry import BoolArray, Float64Array, transform
-from cdpipe.core.voxel import UniqueCells, cell_keys
-from cdpipe.io.out.scans import Outgoing, OutScan, Progress
+from cdpipe.core.geometry.voxel import UniqueCells, cell_keys
+from cdpipe.core.progress import Progress
+from cdpipe.io.out.scans import Outgoing, OutScan
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.plugins import require_extra
-from cdpipe.io.out.scans import Outgoing, OutScan, Progress
+from cdpipe.core.progress import Progress
+from cdpipe.io.out.scans import Outgoing, OutScan
 
 _CLOCK = "clock"
 _POINT_M = 0.02

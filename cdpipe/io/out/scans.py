@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array, make_pose
+from cdpipe.core.progress import Progress
 from cdpipe.io.foreign.scans import PosedClouds
 from cdpipe.io.readers import RecordedScans
 from cdpipe.io.session import ScanChunk
 from cdpipe.model.types import PosedScan, ScanSource
 
-Progress = Callable[[str, int, int], None]
 Fields = Callable[[int, Int32Array], Mapping[str, npt.NDArray[Any]]]
 """Returns further values (N,) by name of the returns at (N,) pixels of a scan, given its index."""
 START_NS = 1_000_000_000

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from cdpipe.core.geometry import Float64Array, Int64Array
-from cdpipe.core.voxel import cell_means
+from cdpipe.core.geometry.voxel import cell_means
 from cdpipe.model.config import PipelineConfig
 from cdpipe.surface.cells import NearReturns, SurfaceCells, make_cells
 from cdpipe.surface.method import Z95, Measured

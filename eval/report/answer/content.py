@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +10,8 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, transform, travelled_m
-from cdpipe.core.voxel import thin
+from cdpipe.core.geometry.voxel import thin
+from cdpipe.core.progress import Progress
 from cdpipe.io.answer import Answer, read_answer
 from cdpipe.io.out.answer_map import require_own_keyframes
 from cdpipe.io.readers import open_session
@@ -20,7 +21,6 @@ from cdpipe.model.aligned import alignment_of
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import ScanSource
 
-OnStage = Callable[[str, int, int], None]
 # Of each session: about so many scans along the path, returns within this range, and at most so many points.
 _SCANS, _REACH_M, MAX_POINTS = 120, 40.0, 120_000
 # First cell of the thinned maps, and how much larger the next one is while there are too many points.
@@ -48,7 +48,9 @@ class AnswerContent:
     paths: tuple[Float64Array, Float64Array]
 
 
-def read_content(before: Path | ScanSource, after: Path | ScanSource, folder: Path, on_stage: OnStage) -> AnswerContent:
+def read_content(
+    before: Path | ScanSource, after: Path | ScanSource, folder: Path, on_stage: Progress
+) -> AnswerContent:
     """Return the content of a stored answer.
 
     Args:
@@ -70,7 +72,7 @@ def read_content(before: Path | ScanSource, after: Path | ScanSource, folder: Pa
 
 
 def gather_content(
-    sessions: tuple[ScanSource, ScanSource], method: str, report: ChangeReport, on_stage: OnStage
+    sessions: tuple[ScanSource, ScanSource], method: str, report: ChangeReport, on_stage: Progress
 ) -> AnswerContent:
     """Return the content of an answer to two opened sessions; other arguments and errors as of `read_content`."""
     before, after = sessions
@@ -133,7 +135,7 @@ def _points_of(returns: Int32Array, source: ScanSource) -> Float64Array:
     return np.concatenate(points)
 
 
-def _thin_session(source: ScanSource, stage: str, on_stage: OnStage) -> tuple[Float64Array, float]:
+def _thin_session(source: ScanSource, stage: str, on_stage: Progress) -> tuple[Float64Array, float]:
     """Return at most `MAX_POINTS` points of scans along the path, one per cell, odom frame, and the edge of a cell."""
     poses = source.odom_T_sensor
     scans = choose_keyframes(poses, max(float(travelled_m(poses)[-1]) / _SCANS, 1e-3))

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array
-from cdpipe.core.voxel import thin
+from cdpipe.core.geometry.voxel import thin
 from cdpipe.model.report import SurfaceField
 from eval.report.answer.content import AnswerContent, near_stretches
 from eval.report.answer.shapes import AFTER_RGB, BEFORE_RGB, REGION_RGB, WRONG_RGB, roof_mask, sphere_path

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib.resources.abc import Traversable
 
 from cdpipe.model.config import preset_files
-from eval.running.run_data import split_variant
+from eval.running.results.grids import split_variant
 from eval.tables.columns import Column, spaced
 from eval.tables.rows import is_told_the_truth
 

@@ -14,7 +14,8 @@ from eval.core.domains import domain_name
 from eval.report.hardness import count_held, name_breaks
 from eval.report.summary import HEADLINES, rank_methods
 from eval.report.surface.surface import SURFACE_COLUMNS
-from eval.running.run_data import RunData, ends_at_merge, off_grids, plan_name, shown_variant, stored_table
+from eval.running.results.grids import off_grids
+from eval.running.results.run_data import RunData, ends_at_merge, plan_name, shown_variant, stored_table
 from eval.tables.columns import Column, share
 from eval.tables.merge_table import ALL_FAMILIES
 from eval.tables.rows import ALL_DOMAINS, is_told_the_truth, numbers, records

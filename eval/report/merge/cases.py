@@ -21,7 +21,9 @@ from cdpipe.model.aligned import alignment_of
 from cdpipe.model.alignment import PathAlignment
 from eval.report.merge.figures import FULL_M, alignment_picture
 from eval.report.tables import Cell, Picture, Table
-from eval.running.run_data import Row, RunData, number, split_variant, text
+from eval.running.results.grids import split_variant
+from eval.running.results.run_data import RunData
+from eval.running.results.values import Row, number, text
 from eval.running.runfolder import read_json
 from eval.scoring.merge_metrics import PAIR_RADIUS_M
 from eval.tables.columns import fine, share, significant

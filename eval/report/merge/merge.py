@@ -11,7 +11,9 @@ from eval.report.merge.cases import MAX_ROWS, Case, case_table, distinct_cases, 
 from eval.report.merge.charts import error_chart, time_chart
 from eval.report.merge.tables import families_table, kinds_table, refusals_table, stated_seconds, times_table
 from eval.report.tables import Section, Table, with_rows
-from eval.running.run_data import RunData, covered_by, ends_at_merge, repeats, shown_variant, text
+from eval.running.results.cases import find_repeats
+from eval.running.results.run_data import RunData, covered_by, ends_at_merge, shown_variant
+from eval.running.results.values import text
 from eval.tables.merge_table import EXACT_M, RIGHT_DEG, RIGHT_M, RULES, TIMES, is_within_target, kinds, merge_table
 from eval.tables.rows import numbers
 
@@ -98,7 +100,7 @@ def _every_case(data: RunData, name: str, notes: list[str]) -> tuple[list[Table]
     Repeated worlds and accepted merges without evidence are left out. Where there are too many for a table, merges that
     were not accepted come first.
     """
-    held = repeats(data)
+    held = find_repeats(data)
     rows = [row for row in data.results if (row["scenario"], row["variant"]) not in held]
     cases = distinct_cases(data, rows, name)
     shown = [case for case in cases if case.evidence or text(case.row, "status") != "ok"]

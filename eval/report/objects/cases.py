@@ -10,7 +10,9 @@ from cdpipe.core.errors import InputError
 from cdpipe.io.answer import read_answer
 from eval.report.objects.objects import AnsweredPair, object_title
 from eval.report.tables import Picture
-from eval.running.run_data import Row, RunData, flag, number, of, split_variant, text
+from eval.running.results.grids import split_variant
+from eval.running.results.run_data import RunData
+from eval.running.results.values import Row, flag, number, select_rows, text
 from eval.tables.columns import count, significant
 from eval.truth.ground_truth import load_ground_truth
 
@@ -70,13 +72,13 @@ def why(data: RunData, row: Row) -> str:
     if number(row, "matched_object") >= 0:
         return ""
     names = {name: row[name] for name in ("scenario", "seed", "variant")}
-    cases = of(data.results, **names)
+    cases = select_rows(data.results, **names)
     if cases and text(cases[0], "status") != "ok":
         return f"no answer: {text(cases[0], 'status').replace('_', ' ')}"
     if flag(row, "is_found"):
         return "its region holds no object that overlaps it"
     wanted = str(int(number(row, "id")))
-    regions = of(data.regions, **names)
+    regions = select_rows(data.regions, **names)
     near = [region for region in regions if wanted in text(region, "found_changes").removesuffix(".0").split(";")]
     if any(flag(region, "is_withdrawn") for region in near):
         return "its region was withdrawn"

@@ -11,7 +11,9 @@ from cdpipe.io.answer import Answer
 from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.report.objects.figures import Layers, Panel, object_panels
 from eval.report.tables import Picture
-from eval.running.run_data import RunData, flag, number, of, pictured_variants, text
+from eval.running.results.cases import pictured_variants
+from eval.running.results.run_data import RunData
+from eval.running.results.values import flag, number, select_rows, text
 from eval.scoring.answer_rows import find_answer_rows
 from eval.tables.columns import share
 from eval.truth.ground_truth import GroundTruth
@@ -49,7 +51,7 @@ class AnsweredPair:
 
     def __init__(self, data: RunData, case: tuple[str, int], truth: GroundTruth, answers: Mapping[str, Answer]) -> None:
         self.truth = truth
-        self._rows = of(data.changes, scenario=case[0], seed=case[1])
+        self._rows = select_rows(data.changes, scenario=case[0], seed=case[1])
         reports = {name: answer.report for name, answer in answers.items()}
         self._objects = {name: report.objects for name, report in reports.items() if report is not None}
         self._object_rows = {name: find_answer_rows(answers[name], truth) for name in self._objects}
@@ -74,7 +76,7 @@ class AnsweredPair:
             if name not in self._objects:
                 panels.append(Panel(title, "no answer", _layers(points, is_true, none, none)))
                 continue
-            row = next(iter(of(self._rows, variant=name, id=change.id)), {})
+            row = next(iter(select_rows(self._rows, variant=name, id=change.id)), {})
             matched = number(row, "matched_object")
             is_mine, is_other = none.copy(), none.copy()
             answered = zip(self._objects[name], self._object_rows[name], strict=True)

@@ -14,7 +14,8 @@ from eval.report.drawing.looks import look_of
 from eval.report.objects.cases import object_cases, voxel_variants
 from eval.report.objects.tables import OBJECT_COLUMNS, OBJECT_COUNTS, WITHDRAWAL_COLUMNS, groups_table
 from eval.report.tables import Section, conditions_table, methods_table, targets_table, with_rows
-from eval.running.run_data import RunData, every_condition, off_grids, shown_variant, stored_table
+from eval.running.results.grids import off_grids
+from eval.running.results.run_data import RunData, every_condition, shown_variant, stored_table
 from eval.running.runfolder import reported
 from eval.tables.columns import select
 from eval.tables.groups import main_changes

@@ -13,7 +13,7 @@ from eval.core.domains import domain_name
 from eval.report.drawing.charts import Chart
 from eval.report.drawing.looks import look_of
 from eval.report.tables import Cell, Table, best_rows, interval_of_row
-from eval.running.run_data import split_variant
+from eval.running.results.grids import split_variant
 from eval.tables.columns import Column, share, spaced
 from eval.tables.rows import ALL_DOMAINS, is_told_the_truth, records
 

@@ -18,7 +18,8 @@ from eval.report.tables import (
     targets_table,
     with_rows,
 )
-from eval.running.run_data import RunData, every_condition, off_grids, shown_variant, stored_table
+from eval.running.results.grids import off_grids
+from eval.running.results.run_data import RunData, every_condition, shown_variant, stored_table
 from eval.running.runfolder import reported
 from eval.tables.columns import Column, scaled, select, share, significant
 from eval.tables.rows import records, with_domain

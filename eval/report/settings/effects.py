@@ -16,7 +16,8 @@ from eval.plans.worlds import get_group
 from eval.report.drawing.charts import Chart
 from eval.report.drawing.looks import look_of
 from eval.report.tables import Cell, Table
-from eval.running.run_data import RunData, of, over_pairs
+from eval.running.results.run_data import RunData
+from eval.running.results.values import over_pairs, select_rows
 from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, Column, count, select, share
 from eval.tables.effects import effects
 from eval.tables.rows import records
@@ -113,7 +114,7 @@ def _lines(
 ) -> Iterator[tuple[str, tuple[Cell, ...]]]:
     """Yield the rows of the table: for each variant the world's own means, then every setting."""
     for variant, own in table.groupby("variant", sort=False):
-        plain = of(data.every_result, scenario=table["reference"].iloc[0], variant=variant)
+        plain = select_rows(data.every_result, scenario=table["reference"].iloc[0], variant=variant)
         means = (Cell(column.shown(over_pairs(plain, column.key))) for column in columns)
         yield str(variant), (Cell("as it is: mean"), Cell(str(len(plain))), *means)
         for setting in settings:

@@ -14,7 +14,8 @@ from eval.core.charts import Axis, Drawing, Heat, Panel, named_ticks
 from eval.core.domains import domain_name
 from eval.report.drawing.charts import Chart
 from eval.report.settings.grids import N_ACROSS, PQ_COLUMN, SHARES
-from eval.running.run_data import RunData, split_variant
+from eval.running.results.grids import split_variant
+from eval.running.results.run_data import RunData
 from eval.tables.columns import RESULT_COLUMNS, Column, significant
 from eval.tables.rows import by_domain, means_with_intervals, numbers, with_domain
 

@@ -14,19 +14,10 @@ from eval.core.charts import COLOURS, Axis, Drawing, Look, Panel, Series, named_
 from eval.core.domains import domain_name
 from eval.report.drawing.charts import Chart
 from eval.report.settings.grids import N_ACROSS, SHARES
-from eval.running.run_data import (
-    Row,
-    RunData,
-    defined,
-    grid_points,
-    interval_over_pairs,
-    of,
-    over_pairs,
-    repeats,
-    sorted_values,
-    split_variant,
-    text,
-)
+from eval.running.results.cases import find_repeats
+from eval.running.results.grids import grid_points, sorted_values, split_variant
+from eval.running.results.run_data import RunData
+from eval.running.results.values import Row, defined, interval_over_pairs, over_pairs, select_rows, text
 from eval.tables.columns import RESULT_COLUMNS
 from eval.tables.rows import with_domain
 
@@ -53,7 +44,7 @@ class Factor:
 
 def factors(data: RunData) -> list[Factor]:
     """Find the settings that were run with two values or more, the preset's own among them, nothing else differing."""
-    held = repeats(data)
+    held = find_repeats(data)
     cases = ((str(row["scenario"]), str(row["variant"])) for row in data.results)
     variants = list(dict.fromkeys(name for world, name in cases if (world, name) not in held))
     on_grid = {name for _, name in grid_points(data)}
@@ -98,7 +89,7 @@ def draw_factors(data: RunData) -> list[Chart]:
 
 def _shared(factor: Factor, rows: Sequence[Row]) -> list[Row]:
     """Return the rows of a setting's variants on the pairs that all of them were run on."""
-    groups = [of(rows, variant=name) for name in factor.points.values()]
+    groups = [select_rows(rows, variant=name) for name in factor.points.values()]
     shared = set.intersection(*({(row["scenario"], row["seed"]) for row in group} for group in groups))
     return [row for group in groups for row in group if (row["scenario"], row["seed"]) in shared]
 
@@ -115,7 +106,7 @@ def _drawing(factor: Factor, rows: Sequence[Row]) -> Drawing | None:
         series = [
             each
             for place, domain in enumerate(domains)
-            for each in _series(factor, of(rows, domain=domain), key, COLOURS[place % len(COLOURS)], domain)
+            for each in _series(factor, select_rows(rows, domain=domain), key, COLOURS[place % len(COLOURS)], domain)
         ]
         ends = [np.append(each.y, 0.0 if each.high is None else each.high) for each in series]
         span = (-0.03, 1.05) if key in SHARES else (0.0, 1.05 * float(np.nanmax(np.concatenate(ends))))
@@ -125,7 +116,7 @@ def _drawing(factor: Factor, rows: Sequence[Row]) -> Drawing | None:
 
 def _series(factor: Factor, rows: Sequence[Row], key: str, colour: str, domain: str) -> list[Series]:
     """Return the line of a domain, and a star at the value that the preset itself has."""
-    groups = [of(rows, variant=name) for name in factor.points.values()]
+    groups = [select_rows(rows, variant=name) for name in factor.points.values()]
     means = np.array([over_pairs(group, key) for group in groups])
     low, high = np.array([interval_over_pairs(group, key) for group in groups]).T
     hover = [

@@ -10,7 +10,9 @@ import numpy as np
 
 from eval.core.charts import BLACK, Axis, Drawing, Heat, Look, Panel, Series, named_ticks
 from eval.report.drawing.charts import Chart
-from eval.running.run_data import GridOf, RunData, grids, of, over_pairs
+from eval.running.results.grids import GridOf, find_grids
+from eval.running.results.run_data import RunData
+from eval.running.results.values import over_pairs, select_rows
 from eval.tables.columns import RESULT_COLUMNS, Column, share
 
 _GRID_KEYS = (
@@ -31,12 +33,14 @@ N_ACROSS = 3
 def draw_grids(data: RunData) -> list[Chart]:
     """Return a chart for every grid of two settings: a heat map of each figure that differs on it."""
     found = []
-    for place, grid in enumerate(grids(data), start=1):
+    for place, grid in enumerate(find_grids(data), start=1):
         values = {key: _values(data, grid, key) for key in _GRID_KEYS}
         shown = [key for key, table in values.items() if len(np.unique(table[~np.isnan(table)])) > 1]
         if shown:
             names = set(grid.points.values())
-            seeds = {row["seed"] for row in of(data.results, scenario=grid.scenario) if row["variant"] in names}
+            seeds = {
+                row["seed"] for row in select_rows(data.results, scenario=grid.scenario) if row["variant"] in names
+            }
             found.append(
                 Chart(
                     f"grid_{place}",
@@ -74,7 +78,8 @@ def _frames(table: Any, column: Column) -> list[Series]:
 
 def _values(data: RunData, grid: GridOf, key: str) -> Any:
     """Return (rows, columns) of a figure's means on a grid, NaN where a point was not run."""
-    own = of(data.results, scenario=grid.scenario)
+    own = select_rows(data.results, scenario=grid.scenario)
     return np.array([
-        [over_pairs(of(own, variant=grid.points.get((a, b))), key) for b in grid.values[1]] for a in grid.values[0]
+        [over_pairs(select_rows(own, variant=grid.points.get((a, b))), key) for b in grid.values[1]]
+        for a in grid.values[0]
     ], dtype=np.float64)  # fmt: skip

@@ -19,7 +19,7 @@ from cdpipe.io.answer import read_answer
 from cdpipe.model.aligned import alignment_of
 from cdpipe.model.report import ChangeReport
 from eval.report.answer.shapes import AFTER_RGB, BEFORE_RGB, REGION_RGB, WRONG_RGB, box_path, roof_mask, sphere_path
-from eval.running.run_data import Row, flag, number, text
+from eval.running.results.values import Row, flag, number, text
 from eval.running.runfolder import RunFolder
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 from sim.view.returns import CHANGE_RGB, Cloud, Rgb

@@ -15,17 +15,9 @@ from cdpipe.model.report import ChangeReport
 from eval.report.maps import Points, RegionMark, State, TruthMark, distance_map, overlay_map, region_map
 from eval.report.objects.objects import object_pictures
 from eval.report.tables import Picture
-from eval.running.run_data import (
-    Row,
-    RunData,
-    first_seed,
-    flag,
-    named_variants,
-    number,
-    pictured_variants,
-    rows_of_case,
-    text,
-)
+from eval.running.results.cases import first_seed, named_variants, pictured_variants, rows_of_case
+from eval.running.results.run_data import RunData
+from eval.running.results.values import Row, flag, number, text
 from eval.running.runfolder import RunFolder
 from eval.scoring.region_metrics import transform_to_map
 from eval.truth.ground_truth import GroundTruth, load_ground_truth

@@ -13,7 +13,9 @@ from typing import Literal
 
 from cdpipe.core.errors import InputError
 from eval.report.site.case_view import view_file, write_case_view
-from eval.running.run_data import RunData, first_seed, of, rows_of_case, scenarios
+from eval.running.results.cases import first_seed, rows_of_case, scenarios
+from eval.running.results.run_data import RunData
+from eval.running.results.values import select_rows
 
 Views = Literal["none", "chosen", "all"]
 HOW_TO_GET = "3-D views of single pairs need the extra view: pip install 'tunnelcd[view]', then write this page again."
@@ -58,7 +60,7 @@ def write_views(data: RunData, variant: str, worst: Sequence[tuple[str, int]], v
         chosen += [(str(row["scenario"]), int(row["seed"])) for row in data.results]
     links, missing = {}, []
     for scenario, seed in dict.fromkeys(chosen):
-        is_run = of(data.results, scenario=scenario, seed=seed, variant=variant)
+        is_run = select_rows(data.results, scenario=scenario, seed=seed, variant=variant)
         if not (data.folder.pair(scenario, seed) / "truth").is_dir() or not is_run:
             continue
         try:

@@ -10,7 +10,9 @@ from cdpipe.core.errors import InputError
 from cdpipe.io.answer import read_answer
 from eval.report.site.site import region_picture
 from eval.report.tables import Picture
-from eval.running.run_data import Row, RunData, number, of, rows_of_case, scenarios, text
+from eval.running.results.cases import rows_of_case, scenarios
+from eval.running.results.run_data import RunData
+from eval.running.results.values import Row, number, select_rows, text
 from eval.tables.columns import share
 from eval.truth.ground_truth import load_ground_truth
 
@@ -35,7 +37,7 @@ def worst_rows(data: RunData, variant: str) -> list[Row]:
     worlds = scenarios(data, unchanged=False)
     rows = [
         row
-        for row in of(data.results, variant=variant)
+        for row in select_rows(data.results, variant=variant)
         if row["scenario"] in worlds and not math.isnan(number(row, "object_iou_point"))
     ]
     if len(rows) <= len(worlds):

@@ -13,7 +13,9 @@ from eval.report.drawing.charts import Chart
 from eval.report.drawing.looks import look_of
 from eval.report.surface.unrolled import draw_unrolled
 from eval.report.tables import Section, conditions_table, methods_table, targets_table, with_rows
-from eval.running.run_data import RunData, every_condition, number, off_grids, stored_table
+from eval.running.results.grids import off_grids
+from eval.running.results.run_data import RunData, every_condition, stored_table
+from eval.running.results.values import number
 from eval.running.runfolder import reported
 from eval.scoring.surface_windows import AREAS_M2
 from eval.tables.columns import Column, scaled, select, share, significant

@@ -13,7 +13,9 @@ from cdpipe.io.answer import read_answer
 from cdpipe.surface import unroll
 from eval.core.figures import blank_figure, data_address, plain_text
 from eval.report.tables import Picture
-from eval.running.run_data import Row, RunData, named_variants, number
+from eval.running.results.cases import named_variants
+from eval.running.results.run_data import RunData
+from eval.running.results.values import Row, number
 from eval.scoring.surface_places import SurfacePlaces, carry_surface, find_surface_places
 from eval.truth.ground_truth import load_ground_truth
 

@@ -19,7 +19,7 @@ from eval.core.output import remove
 from eval.core.provenance import digest
 from eval.running.cell_file import NO_KEY
 from eval.running.runfolder import RunFolder, write_json
-from eval.running.stage_cache import files_digest
+from eval.running.stages.stage_cache import files_digest
 from sim.session.truth import read_pair_truth
 
 Keep = Literal["answers", "sessions", "nothing"]

@@ -22,8 +22,8 @@ from cdpipe.core.files import read_json, read_npz
 from eval.core.output import new_folder
 from eval.core.progress import RunProgress, Silent
 from eval.core.provenance import digest, now
+from eval.plans.cells import list_planned_cases
 from eval.plans.coverage import read_stored_plan
-from eval.plans.plan import list_planned_cases
 from eval.running.cell_rows import ITEM_TABLES, SURFACE_TABLES
 from eval.running.runfolder import RunFolder, open_run_folder, write_json, write_tables
 from eval.running.scaling.keeping import read_dropped

@@ -15,7 +15,7 @@ from eval.core.progress import RunProgress, Silent
 from eval.running.pair_run import TOOLS, Tools, pair_lock_of, write_maps
 from eval.running.runfolder import RunFolder
 from eval.running.scaling.keeping import Dropped, dropped_file, read_dropped, remove_pair, require_same_bytes
-from eval.running.stages import PairStages
+from eval.running.stages.pair_stages import PairStages
 from eval.truth.adapters import pipeline_input
 from scenarios.references import file_digests
 from scenarios.schema import Scenario

@@ -27,7 +27,7 @@ from eval.core.output import make_writable, remove
 from eval.core.progress import RunProgress, shown_progress
 from eval.core.provenance import digest, git_commit, machine
 from eval.core.statistics import bootstrap_interval, mean_with_interval, median
-from eval.plans.plan import parse_seeds_option
+from eval.plans.seeds import parse_seeds_option
 from eval.plans.worlds import world_slug
 from eval.running.runfolder import read_json, write_json
 from eval.studies.descriptors.rows import METHODS, SPHERE, measure_pair

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, require_shape
-from cdpipe.core.voxel import cell_keys
+from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.sensor.ouster import SensorMetadata
 
 ISOLATED_M = 1.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
-from cdpipe.core.voxel import cell_keys, cell_means
+from cdpipe.core.geometry.voxel import cell_keys, cell_means
 from cdpipe.extract.objects import PointGroup, _Surroundings, assemble_objects
 from cdpipe.model.report import ChangedObject
 from cdpipe.model.types import PLACES, MergedMaps, PointMap, SessionName

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import Float64Array, stream, yaw_pose
-from cdpipe.core.voxel import cell_means
+from cdpipe.core.geometry.voxel import cell_means
 from cdpipe.extract.remains import is_heap, is_part_of_remainder
 
 STEP_M = 0.2

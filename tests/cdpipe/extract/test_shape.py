@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import Float64Array, invert, stream, transform, yaw_pose, yaw_rad
-from cdpipe.core.voxel import cell_means
+from cdpipe.core.geometry.voxel import cell_means
 from cdpipe.extract.shape import column_volume_m3, ground_heights, upright_box
 from cdpipe.model.report import ObjectShape
 

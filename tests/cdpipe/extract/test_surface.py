@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, Int64Array, stream, transform, yaw_pose
-from cdpipe.core.groups import label_groups
-from cdpipe.core.voxel import cell_means
+from cdpipe.core.geometry.groups import label_groups
+from cdpipe.core.geometry.voxel import cell_means
 from cdpipe.extract.surface import (
     PlaneTable,
     Site,

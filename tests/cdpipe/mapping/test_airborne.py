@@ -14,7 +14,7 @@ from cdpipe.core.geometry import Float64Array, Int32Array
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
 from cdpipe.mapping import airborne
-from cdpipe.mapping.airborne import ClearScans, LiesOnSurface, clear, drop_airborne
+from cdpipe.mapping.airborne import ClearScans, LiesOnSurface, clear_air, drop_airborne
 from cdpipe.mapping.mapping import build_map
 from cdpipe.model.config import MapConfig, load_config
 from cdpipe.model.types import PosedScan, WrappedScans
@@ -155,7 +155,7 @@ def test_clear_scans_are_as_recorded(pair: Path) -> None:
     source = open_session(pair / "before")
     for one, other in zip(source.scans(), ClearScans(open_session(pair / "before")).scans(), strict=True):
         assert (one.pixels == other.pixels).all()
-    assert clear(source, MapConfig()) is source
+    assert clear_air(source, MapConfig()) is source
 
 
 def test_the_map_of_a_misty_session_holds_its_surfaces(pair: Path) -> None:
@@ -165,7 +165,7 @@ def test_the_map_of_a_misty_session_holds_its_surfaces(pair: Path) -> None:
     def n_off(airborne: str) -> int:
         """Count map points in cells of 0.6 m that the clear session left empty."""
         config = MapConfig.model_validate({"airborne": airborne})
-        points = build_map(clear(open_session(pair / "after"), config), config).points
+        points = build_map(clear_air(open_session(pair / "after"), config), config).points
         return sum(tuple(each) not in cells for each in np.floor(points / 0.6).astype(int).tolist())
 
     assert n_off("drop") < 0.25 * n_off("keep")

@@ -7,7 +7,7 @@ from cdpipe.mapping.counted import CountedScans
 from cdpipe.mapping.mapping import build_map
 from cdpipe.model.config import MapConfig
 from tests.cdpipe.conftest import CloudScans, scanned
-from tests.cdpipe.mapping.test_consistency import replaced
+from tests.cdpipe.mapping.poses.test_consistency import replaced
 
 Steps = list[tuple[str, int, int]]
 

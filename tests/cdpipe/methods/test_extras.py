@@ -17,7 +17,7 @@ from cdpipe.model.config import M3C2EPConfig, load_config
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, SessionName
 from cdpipe.pipeline import detect_changes
-from eval.running.stages import kept_bytes
+from eval.running.stages.pair_stages import kept_bytes
 from tests.cdpipe.rooms import Box, RoomScans
 
 Command = Callable[..., tuple[int, str, str]]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, make_pose, stream
-from cdpipe.core.voxel import cell_keys
+from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.surface.cells import CELL_M, NearReturns, SurfaceCells, make_cells, number_cells
 from cdpipe.surface.places import SurfacePlaces, choose_places
 from cdpipe.surface.unrolled import unroll

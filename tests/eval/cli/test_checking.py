@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from cdpipe.core.errors import InputError
-from eval.cli.tools import check_file
+from eval.cli.commands.tools import check_file
 
 
 @pytest.mark.parametrize(

@@ -12,17 +12,17 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe import pipeline
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Int64Array
 from cdpipe.io.answer import read_answer
 from cdpipe.io.readers import open_session
 from cdpipe.model.config import DescriptorConfig
 from cdpipe.model.types import DescriptorSet, ScanSource
+from cdpipe.pipeline import mapping
 from eval.cli.main import main
 from eval.graft import making
-from eval.plans import plan as plans
-from eval.plans.plan import Plan
+from eval.plans import cells as plan_cells
+from eval.plans.plan import Plan, load_plan
 from eval.report import page
 from eval.running import runner
 from eval.running.pair_run import Tools
@@ -173,13 +173,13 @@ def test_describe_stores_what_detect_then_uses(
         assert code == 0
         assert str(pair / name / "descriptors" / "3deg.npz") in out
     calls: list[str] = []
-    usual = pipeline.describe_scans
+    usual = mapping.describe_scans
 
     def counted(source: ScanSource, chosen: Int64Array, config: DescriptorConfig) -> DescriptorSet:
         calls.extend([source.name] * (len(chosen) > 1))  # one alone warms up
         return usual(source, chosen, config)
 
-    monkeypatch.setattr(pipeline, "describe_scans", counted)
+    monkeypatch.setattr(mapping, "describe_scans", counted)
     arguments = ("detect", pair / "before", pair / "after", "--quiet", "--out")
     assert command(*arguments, tmp_path / "stored")[0] == 0
     assert calls == []
@@ -451,7 +451,7 @@ def test_check_tells_all_mistakes_of_all_files(tmp_path: Path, command: Command)
     scenario.write_text("extends: smoke/one_box\nscore_radius: 3\n")
     code, out, err = command("check", "smoke", "paper/site1", "voxel-diff", plan, preset, scenario)
     assert code == 2
-    assert f"smoke: a plan of {len(plans.expand_cells(plans.load_plan('smoke')))} cells" in out
+    assert f"smoke: a plan of {len(plan_cells.expand_cells(load_plan('smoke')))} cells" in out
     assert "paper/site1: a scenario" in out
     assert "voxel-diff: a preset" in out
     lines = err.splitlines()
@@ -492,7 +492,7 @@ def test_a_plan_whose_cells_are_refused_leaves_no_folder(
     def refused(_: Plan) -> None:
         raise InputError("settings that contradict each other")
 
-    monkeypatch.setattr(plans, "expand_cells", refused)
+    monkeypatch.setattr(plan_cells, "expand_cells", refused)
     assert_refused(command("run", "smoke", "--out", tmp_path / "out"), "contradict")
     assert tree(tmp_path) == set()
 

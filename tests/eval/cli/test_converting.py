@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.geometry import transform
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import Session, SessionWriter, read_session
-from eval.cli import converting
+from eval.cli.commands import converting
 from eval.cli.main import main
 from eval.truth.scoring_points import build_scoring_points
 from sim.session.truth import read_labels, read_pair_truth

@@ -3,10 +3,10 @@ from pathlib import Path
 
 import pytest
 
-from cdpipe import pipeline
 from cdpipe.core.errors import InputError
 from cdpipe.core.plugins import METHODS, entry_points
 from cdpipe.methods.registry import load_method
+from cdpipe.pipeline import mapping
 
 Command = Callable[..., tuple[int, str, str]]
 EXTRAS = {"m3c2": "m3c2", "m3c2-ep": "m3c2", "dufomap": "dufomap", "octomap": "octomap"}
@@ -17,7 +17,7 @@ def test_a_missing_extra_is_named_before_anything_is_mapped(
     method: str, tiny_pair: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("cdpipe.core.plugins.find_spec", lambda name: None)
-    monkeypatch.delattr(pipeline, "build_map")
+    monkeypatch.delattr(mapping, "build_map")
     folders = (tiny_pair / "before", tiny_pair / "after", "--preset", method, "--out", tmp_path / "out")
     code, out, err = command("detect", *folders)
     assert code == 2
@@ -34,7 +34,7 @@ def test_a_missing_extra_of_a_rival_of_displacement_is_named_before_anything_is_
     tiny_pair: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("cdpipe.core.plugins.find_spec", lambda name: None)
-    monkeypatch.delattr(pipeline, "build_map")
+    monkeypatch.delattr(mapping, "build_map")
     given = ("--set", "surface.method=m3c2-ep", "--out", tmp_path / "out")
     code, out, err = command("detect", tiny_pair / "before", tiny_pair / "after", *given)
     assert code == 2

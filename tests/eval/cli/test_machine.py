@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from cdpipe.model.config import settings_table
-from eval.cli import tools
+from eval.cli.commands import tools
 from eval.cli.doctor import Finding
 from eval.core.printing import echo_json
 from eval.plans.files import plan_names

@@ -11,7 +11,7 @@ import pytest
 from cdpipe.core.errors import InputError
 from eval.leaderboard.comparison import FIGURES, compare_with_reference, list_lines, write_tables_of
 from eval.leaderboard.reference import find_reference, take_other_methods
-from eval.running.run_data import RunData, read_run
+from eval.running.results.run_data import RunData, read_run
 from eval.running.runfolder import write_json
 from eval.scoring.scoring import METRICS_VERSION
 

@@ -19,7 +19,7 @@ from eval.leaderboard.given_merge import write_merge
 from eval.leaderboard.submission import pack_submission
 from eval.oracles.merge import OracleMerge, align_by_truth
 from eval.running.rescoring import rescore
-from eval.running.stages import PairStages
+from eval.running.stages.pair_stages import PairStages
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import load_ground_truth
 from scenarios.library import load_scenario

@@ -10,8 +10,9 @@ from cdpipe.core.geometry import make_pose, yaw_pose
 from cdpipe.core.names import path_part
 from cdpipe.model.config import QueryConfig
 from eval.oracles.regions import regions_by_truth
+from eval.plans.cells import expand_cells
 from eval.plans.changes import change_plan
-from eval.plans.plan import Plan, expand_cells, load_plan
+from eval.plans.plan import Plan, load_plan
 from eval.plans.variants import name_variant
 from eval.scoring.region_metrics import match_regions, transform_to_world
 from eval.tables.merge_table import is_oracle

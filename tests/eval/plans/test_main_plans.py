@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import Counter
 
 from cdpipe.model.config import preset_names
-from eval.plans.plan import expand_cells, load_plan
+from eval.plans.cells import expand_cells
+from eval.plans.plan import load_plan
 from eval.plans.worlds import find_references, list_settings_over
 from scenarios import load_scenario, scenario_names
 from scenarios.catalogue import EFFECT_GROUPS

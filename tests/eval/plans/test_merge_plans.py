@@ -9,8 +9,9 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from eval.core.statistics import ENOUGH_PAIRS
+from eval.plans.cells import expand_cells
 from eval.plans.changes import change_plan
-from eval.plans.plan import expand_cells, load_plan
+from eval.plans.plan import load_plan
 from eval.plans.variants import Cell
 
 VALIDATION, TEST = range(10000, 20000), range(20000, 30000)

@@ -7,10 +7,12 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.names import path_part
 from cdpipe.model.config import load_config
 from eval.plans import plan as plan_module
+from eval.plans.cells import expand_cells, list_planned_cases
 from eval.plans.changes import change_plan
 from eval.plans.files import plan_names
 from eval.plans.parts import require_valid_setting
-from eval.plans.plan import Plan, expand_cells, list_planned_cases, load_plan, parse_seeds
+from eval.plans.plan import Plan, load_plan
+from eval.plans.seeds import parse_seeds
 from eval.plans.targets import Targets
 from eval.plans.variants import name_variant
 from eval.plans.worlds import format_setting, require_draws, world_slug

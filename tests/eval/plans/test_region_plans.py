@@ -12,7 +12,8 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import Document, validate
 from cdpipe.sensor.ouster import profile_names
 from eval.core.domains import domain_of
-from eval.plans.plan import Plan, expand_cells, load_plan
+from eval.plans.cells import expand_cells
+from eval.plans.plan import Plan, load_plan
 from eval.plans.worlds import find_references
 from scenarios import load_scenario
 from scenarios.schema import Scenario

@@ -13,7 +13,8 @@ from pydantic.fields import FieldInfo
 from cdpipe.model.config import load_config
 from cdpipe.sensor.ouster import load_profile, profile_names
 from eval.core.statistics import ENOUGH_PAIRS
-from eval.plans.plan import expand_cells, load_plan
+from eval.plans.cells import expand_cells
+from eval.plans.plan import load_plan
 from eval.plans.worlds import find_references, list_settings_over, list_worlds
 from scenarios.library import load_scenario
 from scenarios.schema import Sensor

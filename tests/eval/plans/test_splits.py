@@ -12,8 +12,9 @@ import pandas as pd
 import pytest
 
 from cdpipe.core.errors import InputError
+from eval.plans.cells import expand_cells
 from eval.plans.changes import change_plan
-from eval.plans.plan import expand_cells, load_plan
+from eval.plans.plan import load_plan
 from eval.plans.splits import load_splits, seal_seeds, version_name
 
 SEALED_PLANS = ("main", "regions", "objects", "null", "merge")

@@ -6,8 +6,9 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from eval.plans import worlds
+from eval.plans.cells import expand_cells
 from eval.plans.changes import change_plan
-from eval.plans.plan import Plan, expand_cells, load_plan
+from eval.plans.plan import Plan, load_plan
 from eval.plans.worlds import (
     World,
     find_references,

@@ -12,7 +12,7 @@ import pytest
 
 from eval.report.comparing import BETTER, COLUMNS
 from eval.report.comparison import COLOURS, compare_sides, detail_tables, matrix_table, overview, sentences
-from eval.running.sides import Side, read_side
+from eval.running.results.sides import Side, read_side
 from eval.scoring.scoring import METRICS_VERSION
 
 Command = Callable[..., tuple[int, str, str]]

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from eval.report.cost import COLUMNS, draw_pareto, front, pareto_table
-from eval.running.run_data import RunData
+from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
 from tests.eval.report.drawing.drawn import read_panels
 

@@ -18,8 +18,8 @@ from eval.report.comparison import compare_sides, write_comparison
 from eval.report.latex import to_latex
 from eval.report.page import write_page
 from eval.report.tables import Cell, Table
+from eval.running.results.sides import read_side
 from eval.running.runfolder import write_json
-from eval.running.sides import read_side
 from tests.eval.report.test_page_browser import needs_browser, opened
 
 RUN = "document.title='owned'"

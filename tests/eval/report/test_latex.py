@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from eval.report.latex import latex_tables
-from eval.running.run_data import RunData
+from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
 
 NAN = float("nan")

@@ -13,7 +13,8 @@ from eval.core.charts import BLUE, ORANGE
 from eval.report.maps import RED, RegionMark, TruthMark, distance_map, joined_labels, overlay_map, region_map
 from eval.report.objects.figures import Panel, object_panels, oblique_view
 from eval.report.tables import beside, best
-from eval.running.run_data import RunData, grids, off_grids, split_variant
+from eval.running.results.grids import find_grids, off_grids, split_variant
+from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
 from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, count, significant
 
@@ -112,7 +113,7 @@ def test_a_grid_varies_two_settings_and_may_fix_others(tmp_path: Path) -> None:
     points = [f"p[a.x={a},b.y={b},c.n=8]" for a in (0.3, 10.0) for b in (1, 2)]
     others = ["p", "p[a.x=0.3,b.y=1]", "q[a.x=1]", "q[a.x=2]"]
     rows = tuple({"scenario": "s", "variant": name} for name in [*points, *others])
-    (grid,) = grids(RunData(RunFolder(tmp_path), rows, (), (), {}, ()))
+    (grid,) = find_grids(RunData(RunFolder(tmp_path), rows, (), (), {}, ()))
     assert (grid.preset, grid.keys) == ("p with c.n=8", ("a.x", "b.y"))
     assert grid.values == (("0.3", "10.0"), ("1", "2"))
     assert grid.points["10.0", "1"] == points[2]

@@ -12,9 +12,9 @@ import pytest
 from cdpipe.core.errors import InputError
 from eval.report.comparison import compare_sides, write_comparison
 from eval.report.page import write_page
-from eval.running.run_data import plan_name, read_run, stored_table
+from eval.running.results.run_data import plan_name, read_run, stored_table
+from eval.running.results.sides import read_side
 from eval.running.runfolder import RunFolder, reported, write_json
-from eval.running.sides import read_side
 from eval.tables.columns import UNDEFINED
 from tests.eval.report.test_hostile_names import PLAIN, write_run
 

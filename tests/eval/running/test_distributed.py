@@ -28,7 +28,8 @@ from cdpipe.core.names import path_part
 from eval.core import cluster, progress
 from eval.core.cluster import Where
 from eval.core.progress import Lines
-from eval.plans.plan import Plan, expand_cells, load_plan
+from eval.plans.cells import expand_cells
+from eval.plans.plan import Plan, load_plan
 from eval.running import pair_run, runner
 from eval.running.pair_run import Made, Tools
 from eval.running.run_workers import Task, _unfit, remove_traces, work_on

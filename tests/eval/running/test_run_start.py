@@ -12,7 +12,7 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.methods.registry import Method
-from eval.cli.tools import check_file
+from eval.cli.commands.tools import check_file
 from eval.core import cluster
 from eval.core.cluster import Where, exposure, require_reachable
 from eval.core.progress import Lines, Silent

@@ -25,14 +25,15 @@ from cdpipe.pipeline import Done
 from cdpipe.sensor.ouster import load_profile
 from eval.core.output import remove
 from eval.core.progress import Silent
+from eval.plans.cells import expand_cells
 from eval.plans.changes import change_plan
-from eval.plans.plan import Plan, expand_cells, load_plan
+from eval.plans.plan import Plan, load_plan
 from eval.running import pair_run
 from eval.running.pair_run import Tools
 from eval.running.rescoring import rescore
 from eval.running.runfolder import RunFolder, open_run_folder, start_run_folder, write_json, write_tables
 from eval.running.runner import RunOutcome, _provenance, run_plan
-from eval.running.stages import time_parts
+from eval.running.stages.pair_stages import time_parts
 from eval.truth.adapters import pipeline_input
 from scenarios.library import load_scenario
 from scenarios.references import file_digests

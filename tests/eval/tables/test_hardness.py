@@ -11,7 +11,7 @@ from eval.core.figures import picture
 from eval.plans.plan import Plan, load_plan
 from eval.report.hardness import draw_hardness
 from eval.report.page import write_page
-from eval.running.run_data import read_run
+from eval.running.results.run_data import read_run
 from eval.running.runfolder import write_json
 from eval.tables.columns import UNDEFINED
 from eval.tables.hardness import breaking_points, hardness_table

@@ -10,7 +10,8 @@ import yaml
 
 from cdpipe.core.geometry import stream
 from eval.core.statistics import N_RESAMPLES, mean_with_interval
-from eval.plans.plan import expand_cells, load_plan
+from eval.plans.cells import expand_cells
+from eval.plans.plan import load_plan
 from eval.plans.targets import Target, Targets
 from eval.tables.groups import clustered_interval, group_overview, main_changes, objects_by_group
 from eval.tables.object_table import FILES, ORACLE_VARIANT, object_overview, object_tables

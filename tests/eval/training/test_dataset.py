@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import invert, transform, yaw_rad
-from cdpipe.core.path_frames import path_frames
+from cdpipe.core.geometry.path_frames import path_frames
 from cdpipe.descriptors.range_image import range_image
 from cdpipe.descriptors.sphere_image import COLUMNS, ROWS, pixels, sphere_image
 from cdpipe.mapping.mapping import build_map

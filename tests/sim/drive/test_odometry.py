@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import invert, make_pose, transform, travelled_m, yaw_rad
+from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.core.spooled import SpooledArray
-from cdpipe.core.voxel import cell_keys
 from cdpipe.io.session import Session, read_session
-from cdpipe.mapping import odometry
-from cdpipe.mapping.odometry import deskew_at_constant_velocity
+from cdpipe.mapping.poses import odometry
+from cdpipe.mapping.poses.odometry import deskew_at_constant_velocity
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Odometry, Platform, Prop, Roughness, Scenario, SessionPlan, Tunnel
 from sim.drive.odometry import register_scans, start_pose

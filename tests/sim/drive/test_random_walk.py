@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, invert, yaw_rad
-from cdpipe.core.motion import Motion, make_motion
+from cdpipe.core.geometry.motion import Motion, make_motion
 from scenarios.schema import FITTED_WALK, Odometry
 from sim.drive.odometry import walk_motion
 

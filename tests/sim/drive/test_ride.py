@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array
-from cdpipe.core.motion import Motion
+from cdpipe.core.geometry.motion import Motion
 from scenarios.schema import Platform, Scenario, SessionPlan
 from sim.drive.path import Path
 from sim.drive.ride import follow_floor, integrate_time, lean_angles, ride

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, invert, require_poses, travelled_m, yaw_rad
-from cdpipe.core.motion import Motion, make_motion
+from cdpipe.core.geometry.motion import Motion, make_motion
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Floor, Odometry, Platform, Prop, Scenario, SessionPlan, Stones
 from sim.drive.path import plan_path

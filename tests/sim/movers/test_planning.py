@@ -8,7 +8,7 @@ import pytest
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import transform
-from cdpipe.core.motion import Motion
+from cdpipe.core.geometry.motion import Motion
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Mover, Prop, Scenario, Section, SessionPlan, Tunnel
 from sim.drive.trajectory import plan_trajectory

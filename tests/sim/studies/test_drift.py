@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, make_pose
-from cdpipe.core.motion import make_motion
+from cdpipe.core.geometry.motion import make_motion
 from scenarios.schema import GAITS, Odometry
 from sim.drive.odometry import walk_motion
 from sim.studies.drift import (

@@ -16,8 +16,8 @@ from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
+from eval.cli.commands.viewing import load_view
 from eval.cli.main import main
-from eval.cli.world import load_view
 from scenarios import load_scenario
 from scenarios.schema import MeshFile, Mover, Place, Prop, Scenario, Shift, SurfaceChange, SurfacePlace, Tunnel
 from sim.geometry.mesh import Mesh

@@ -18,7 +18,7 @@ from eval.report.regions.charts import draw_free_response, draw_roc, draw_sizes
 from eval.report.scenarios import draw_scenarios
 from eval.report.settings.factors import draw_factors, factors
 from eval.report.settings.grids import draw_grids
-from eval.running.run_data import RunData
+from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
 from tests.eval.report.drawing.drawn import DrawnSeries, read_panels
 

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from eval.report.framing.headline import name_leaders, write_answer, write_title
-from eval.running.run_data import RunData
+from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
 from eval.tables.columns import Column, share
 

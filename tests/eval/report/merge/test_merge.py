@@ -20,7 +20,7 @@ from eval.report.merge.cases import true_alignment
 from eval.report.merge.merge import draw_merge
 from eval.report.merge.tables import times_table
 from eval.report.page import write_page
-from eval.running.run_data import read_run
+from eval.running.results.run_data import read_run
 from eval.running.runfolder import RunFolder
 from eval.tables.merge_table import merge_table
 

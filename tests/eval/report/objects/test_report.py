@@ -14,7 +14,7 @@ from eval.report.objects.report import draw_objects
 from eval.report.objects.tables import OBJECT_COLUMNS, OBJECT_COUNTS, WITHDRAWAL_COLUMNS
 from eval.report.page import write_page
 from eval.report.tables import methods_table
-from eval.running.run_data import RunData, figures_of_plan, read_run
+from eval.running.results.run_data import RunData, figures_of_plan, read_run
 from eval.running.runfolder import RunFolder, write_json
 from eval.tables.object_table import FILES, ORACLE_VARIANT, object_tables
 from eval.tables.rows import with_domain

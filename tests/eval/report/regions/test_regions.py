@@ -14,7 +14,7 @@ from eval.report.page import write_page
 from eval.report.regions.budgets import budget_areas, shown_budgets
 from eval.report.regions.regions import draw_regions
 from eval.report.summary import draw_summary
-from eval.running.run_data import read_run
+from eval.running.results.run_data import read_run
 from eval.running.runfolder import write_json
 from eval.tables.region_table import FILES, region_tables
 

@@ -11,7 +11,8 @@ import pytest
 from eval.core.figures import picture
 from eval.report.page import write_page
 from eval.report.settings.effects import draw_effects, effect_chart, shorten
-from eval.running.run_data import first_seed, named_variants, read_run, scenarios
+from eval.running.results.cases import first_seed, named_variants, scenarios
+from eval.running.results.run_data import read_run
 
 NAN = float("nan")
 PLAIN, NOISE, BOTH = (

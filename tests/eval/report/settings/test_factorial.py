@@ -8,7 +8,7 @@ import pytest
 from eval.core.figures import picture
 from eval.report.page import write_page
 from eval.report.settings.factorial import draw_factorial, factorial_table
-from eval.running.run_data import RunData, read_run
+from eval.running.results.run_data import RunData, read_run
 
 SURFACE, VOXEL = "[extract.method=surface]", "[extract.method=voxel,extract.voxel_m=0.3]"
 

@@ -14,7 +14,7 @@ from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport
 from eval.report.answer.shapes import box_path, roof_mask, sphere_path
 from eval.report.site.case_view import case_view, write_case_view
 from eval.report.site.views import write_views
-from eval.running.run_data import RunData
+from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
 from eval.truth.ground_truth import load_ground_truth
 

@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 
 from eval.report.site.worst import draw_worst, worst_rows
-from eval.running.run_data import RunData
+from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
 
 

@@ -10,7 +10,7 @@ from cdpipe.surface import unroll
 from eval.report.page import write_page
 from eval.report.surface.surface import draw_surface
 from eval.running.cell_file import cell_document
-from eval.running.run_data import read_run
+from eval.running.results.run_data import read_run
 from eval.running.runfolder import RunFolder, write_json, write_tables
 from eval.scoring.scoring import CaseScore
 from tests.eval.scoring.surface_worlds import score_field, true_field, wall_truth

@@ -10,7 +10,8 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import path_part
-from eval.plans.plan import Plan, expand_cells
+from eval.plans.cells import expand_cells
+from eval.plans.plan import Plan
 from eval.report.page import write_page
 from eval.running.runfolder import RunFolder, read_json, write_json, write_tables
 from eval.running.runner import list_cells

@@ -1,0 +1,225 @@
+"""A session's own map made consistent: every scan is registered once more with the scans around it.
+
+Odometry errs from scan to scan, mostly along the drift and in roll. Walls then stand twice in the map, centimetres
+apart, and metres where the odometry found no start. Here each scan is registered, point to plane, with the map of other
+scans within a few metres of path. The relative pose of the odometry to its neighbours is the prior: it decides where
+the walls do not.
+
+1. From the middle of the session to both ends, each scan is registered with the scans before it (`_follow`).
+2. Sweeps register every scan with those on both sides (`_sweep`): first each with every second scan alone, never
+   with itself, as a scan that is off would find itself; then with all, which ties even and odd scans together.
+3. A scan that no pose lays on the walls is bent: the sensor was shaken within the revolution. Its points are left out.
+4. Where the session comes through a place that it knows, the loop is closed (`loops.py`), and the scans of both
+   passes are registered with one another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert
+from cdpipe.core.progress import Progress, report_nothing
+from cdpipe.mapping.poses.loops import Loop, close_loops, find_loops
+from cdpipe.mapping.poses.scan_registration import Registration, Samples, Target, register_scan
+from cdpipe.model.types import PosedScan, ScanSource, WrappedScans
+
+# A block of path is registered with one map: its scans, and those within this way before and after it.
+_BLOCK_M, _AROUND_M = 4.0, 6.0
+# A scan is followed in the map of the scans within this way behind it, which is made anew once per metre.
+_BEHIND_M, _RENEWED_M = 10.0, 1.0
+# Scans agree already if a sweep moves nine of ten by no more than this: 0.4 to 0.6 cm at constant drift, 4 cm with
+# KISS-ICP (validation tunnels of `narrow` and `wide`).
+_AGREE_M = 0.015
+_ROUNDING = 1e-9  # of an interpolated percentile
+# A scan is bent if so many of its points are off the walls, and so many times as many as of the scans around it.
+_BENT_SHARE, _BENT_FACTOR = 0.05, 3.0
+_FOLLOWING = Registration(voxel_m=0.3, correspondence_m=1.0, robust_m=0.2, step_m=0.2, step_rad=0.02)
+_BY_HALVES = Registration(voxel_m=0.2, correspondence_m=0.5, robust_m=0.07, step_m=0.1, step_rad=0.01)
+_WITH_ALL = Registration(voxel_m=0.2, correspondence_m=0.5, robust_m=0.05, step_m=0.1, step_rad=0.01)
+
+
+class ConsistentScans(WrappedScans):
+    """A session with other poses than those that were recorded, and without the points of (S,) bent scans."""
+
+    def __init__(self, source: ScanSource, odom_T_sensor: Float64Array, is_bent: BoolArray) -> None:
+        super().__init__(source)
+        self._poses, self._is_bent = odom_T_sensor, is_bent
+
+    @property
+    def odom_T_sensor(self) -> Float64Array:
+        """(S, 4, 4) consistent pose of each scan, odom frame."""
+        return self._poses
+
+    def over(self, source: ScanSource) -> ConsistentScans:
+        """Return the scans of another source with these poses, and without the points of the same bent scans."""
+        return ConsistentScans(source, self._poses, self._is_bent)
+
+    def scan(self, index: int) -> PosedScan:
+        """Read one scan."""
+        return self._corrected(super().scan(index))
+
+    def scans(self) -> Iterator[PosedScan]:
+        """Read all scans in order."""
+        for scan in super().scans():
+            yield self._corrected(scan)
+
+    def _corrected(self, scan: PosedScan) -> PosedScan:
+        n = 0 if self._is_bent[scan.index] else len(scan.points_sensor)
+        return replace(scan.keep(slice(n)), odom_T_sensor=self._poses[scan.index])
+
+
+def make_consistent(
+    source: ScanSource, *, has_loops: bool = False, on_step: Progress = report_nothing
+) -> ConsistentScans:
+    """Return a session with poses under which its scans agree with one another; the recorded ones where they do so.
+
+    Time grows with the number of scans; the points of a long session are in a temporary file.
+
+    Args:
+        source: The session.
+        has_loops: Whether loops are closed.
+        on_step: Told how many scans were registered each time that all are: step `registration 1`, and so on.
+
+    Raises:
+        InputError: A scan cannot be read.
+    """
+    poses = source.odom_T_sensor
+    is_bent = np.zeros(len(poses), dtype=np.bool_)
+    if len(poses) == 1:
+        return ConsistentScans(source, poses, is_bent)
+    scans, told = Samples(source), _Told(on_step, len(poses))
+    if not _agree(scans, poses, told):
+        poses = _follow(scans, _FOLLOWING, told)
+        poses, off_share = _sweep_all(scans, poses, _BY_HALVES, told, by_halves=True)
+        is_bent = _find_bent(scans.path_m, off_share)
+        poses, _ = _sweep_all(scans, poses, _WITH_ALL, told)
+    loops = find_loops(scans, poses) if has_loops else ()
+    if loops:
+        poses, _ = _sweep_all(scans, close_loops(scans.path_m, poses, loops), _WITH_ALL, told, loops=loops)
+    return ConsistentScans(source, poses, is_bent)
+
+
+def _agree(scans: Samples, poses: Float64Array, told: _Told) -> bool:
+    """Return whether a sweep moves nine of ten scans by no more than `_AGREE_M`; it ends as soon as that is certain."""
+    n, moved_m = len(poses), np.zeros(len(poses))
+    below = int(0.9 * (n - 1))  # the 90th percentile lies between this one of the sorted values and the next
+    n_near = n_far = 0
+    for own, found, _ in _sweep(scans, poses, _WITH_ALL, told):
+        moved_m[own] = np.linalg.norm((found - poses[own])[:, :3, 3], axis=1)
+        n_near += int(np.count_nonzero(moved_m[own] < _AGREE_M * (1 - _ROUNDING)))
+        n_far += int(np.count_nonzero(moved_m[own] > _AGREE_M * (1 + _ROUNDING)))
+        if n_near >= below + 2 or n_far >= n - below:
+            break
+    return not np.percentile(moved_m, 90) > _AGREE_M
+
+
+class _Told:
+    """Tells how many scans each registration of all scans has done."""
+
+    def __init__(self, on_step: Progress, total: int) -> None:
+        self._on_step, self._total = on_step, total
+        self._number = self._done = 0
+
+    def begin(self) -> None:
+        self._number, self._done = self._number + 1, 0
+
+    def add(self) -> None:
+        self._done += 1
+        self._on_step(f"registration {self._number}", self._done, self._total)
+
+
+def _find_bent(path_m: Float64Array, off_share: Float64Array) -> BoolArray:
+    """Return which scans are bent, by (S,) path and (S,) shares of points off the walls."""
+    first, end = (np.searchsorted(path_m, path_m + way_m) for way_m in (-_AROUND_M, _AROUND_M))
+    usual = [np.median(off_share[a:b]) for a, b in zip(first, np.maximum(end, first + 1), strict=True)]
+    return np.asarray(off_share > np.maximum(_BENT_SHARE, _BENT_FACTOR * np.array(usual)))
+
+
+def _follow(scans: Samples, settings: Registration, told: _Told) -> Float64Array:
+    """Return the (S, 4, 4) poses, each found from its neighbour's; the middle scan keeps its recorded pose."""
+    found, path_m = scans.recorded.copy(), scans.path_m
+    n, middle = len(found), len(found) // 2
+    told.begin()
+    for way in (range(middle + 1, n), range(middle - 1, -1, -1)):
+        target, made_m = None, np.inf
+        for index in way:
+            last = index - way.step
+            guess = found[last] @ invert(scans.recorded[last]) @ scans.recorded[index]
+            if target is None or abs(path_m[index] - made_m) >= _RENEWED_M:
+                behind = np.arange(middle, index, way.step)
+                near = behind[np.abs(path_m[behind] - path_m[index]) <= _BEHIND_M]
+                made_m = path_m[index]
+                target = Target(scans, found, near if len(near) else behind[-1:], guess[:3, 3], settings.voxel_m)
+            found[index], _ = register_scan(scans.of_scan(index), guess, [guess], target, settings)
+            told.add()
+    return found
+
+
+def _sweep_all(
+    scans: Samples, poses: Float64Array, settings: Registration, told: _Told, **choices: Any
+) -> tuple[Float64Array, Float64Array]:
+    """Return all (S, 4, 4) poses after one `_sweep`, and the (S,) shares; choices are keyword arguments of `_sweep`."""
+    found, off_share = poses.copy(), np.zeros(len(poses))
+    for own, found_of_block, off_share_of_block in _sweep(scans, poses, settings, told, **choices):
+        found[own], off_share[own] = found_of_block, off_share_of_block
+    return found, off_share
+
+
+def _sweep(
+    scans: Samples,
+    poses: Float64Array,
+    settings: Registration,
+    told: _Told,
+    *,
+    by_halves: bool = False,
+    loops: tuple[Loop, ...] = (),
+) -> Iterator[tuple[Int64Array, Float64Array, Float64Array]]:
+    """Register all scans of a block with the poses before it, block by block.
+
+    Args:
+        scans: The scans.
+        poses: (S, 4, 4) poses.
+        settings: Of the registrations.
+        told: Told of every scan.
+        by_halves: Whether a scan is compared with every second scan alone.
+        loops: Closed loops: scans of both passes are registered with one another.
+
+    Yields:
+        (B,) scans of a block, their (B, 4, 4) poses, and the (B,) share of each scan's points that are off the walls.
+    """
+    told.begin()
+    steps = invert(scans.recorded[:-1]) @ scans.recorded[1:]
+    blocks = np.floor(scans.path_m / _BLOCK_M)
+    for block in np.unique(blocks):
+        own = np.flatnonzero(blocks == block)
+        near = np.flatnonzero(_is_near(scans.path_m, own[0], own[-1], loops))
+        centre = poses[own[len(own) // 2], :3, 3]
+        halves = [near[near % 2 == 1], near[near % 2 == 0]] if by_halves else [near, near]
+        if not all(len(half) for half in halves):
+            continue
+        first = Target(scans, poses, halves[0], centre, settings.voxel_m)
+        second = Target(scans, poses, halves[1], centre, settings.voxel_m) if by_halves else first
+        found, off_share = poses[own], np.zeros(len(own))
+        for number, index in enumerate(own.tolist()):
+            predicted = [poses[index - 1] @ steps[index - 1]] if index else []
+            predicted += [poses[index + 1] @ invert(steps[index])] if index + 1 < len(poses) else []
+            target = first if index % 2 == 0 else second
+            found[number], off_share[number] = register_scan(
+                scans.of_scan(index), poses[index], predicted, target, settings
+            )
+            told.add()
+        yield own, found, off_share
+
+
+def _is_near(path_m: Float64Array, first: int, last: int, loops: tuple[Loop, ...]) -> BoolArray:
+    """Return which (S,) scans are near to a block of scans along the path, or along another pass of a closed loop."""
+    is_near: BoolArray = (path_m >= path_m[first] - _AROUND_M) & (path_m <= path_m[last] + _AROUND_M)
+    for loop in loops:
+        for here, there in ((loop.scan, loop.other), (loop.other, loop.scan)):
+            if path_m[first] - _BLOCK_M <= path_m[here] <= path_m[last] + _BLOCK_M:
+                is_near |= np.abs(path_m - path_m[there]) <= _AROUND_M
+    return is_near

@@ -1,0 +1,125 @@
+"""Between the frames of consistent maps and those of the recorded odometries, in which answers are given.
+
+`map.consistency` gives the scans of a session other poses than those that were recorded. Whoever reads an answer has
+the recorded ones. What lies at a keyframe moves with the keyframe: the transform between both frames at a place is that
+of the nearest keyframe.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from cdpipe.core.geometry import Float64Array, invert, transform_each
+from cdpipe.model.alignment import PathAlignment
+from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, SurfaceField
+from cdpipe.model.types import PointMap
+
+
+def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) -> ChangeReport:
+    """Return a report with its places in the frames of the recorded odometries.
+
+    The report is returned unchanged where both maps have these frames. An object moves as a whole, by the motion of its
+    middle, and keeps its size and its upright axis. The alignment at an after keyframe takes what the sensor saw there
+    to the place where it was found. `before_T_after` stays as it was found, because the frames differ from place to
+    place.
+
+    Args:
+        report: In the frames of the maps.
+        before: The before map.
+        after: The after map.
+    """
+    if before.recorded_T_sensor is None and after.recorded_T_sensor is None:
+        return report
+    local = report.local_before_T_after
+    scans = report.keyframe_scans[1]
+    odom_T_keyframe = after.odom_T_sensor[scans]
+    if local is None:
+        local = np.repeat(report.before_T_after[None], len(scans), axis=0)
+    map_T_keyframe = local @ odom_T_keyframe
+    recorded = recorded_T_map(before, map_T_keyframe[:, :3, 3])
+    recorded_T_keyframe = odom_T_keyframe if after.recorded_T_sensor is None else after.recorded_T_sensor[scans]
+    return replace(
+        report,
+        regions=_move_regions(report.regions, recorded_T_map(before, report.regions.centres_map)),
+        objects=tuple(_move_objects(report.objects, before)),
+        local_before_T_after=recorded @ map_T_keyframe @ invert(recorded_T_keyframe),
+        surface=None if report.surface is None else _move_surface(report.surface, before),
+    )
+
+
+def regions_as_mapped(regions: ChangeRegions, before: PointMap) -> ChangeRegions:
+    """Return regions in the frame of a before map from those in the frame of its recorded odometry."""
+    if before.recorded_T_sensor is None:
+        return regions
+    map_T_recorded = _transforms_at(regions.centres_map, _recorded_T_keyframe(before), before.odom_T_keyframe)
+    return _move_regions(regions, map_T_recorded)
+
+
+def merge_as_mapped(before_T_after: Float64Array, before: PointMap, after: PointMap) -> PathAlignment:
+    """Return a (4, 4) merge of the recorded frames as an alignment of two maps with consistent poses.
+
+    What an after keyframe saw lands where the merge puts it. The alignment is the merge itself where both maps have the
+    recorded poses.
+    """
+    if all(np.array_equal(_recorded_T_keyframe(each), each.odom_T_keyframe) for each in (before, after)):
+        return PathAlignment.rigid(before_T_after)
+    recorded_T_keyframe, odom_T_keyframe = before_T_after @ _recorded_T_keyframe(after), after.odom_T_keyframe
+    map_T_recorded = _transforms_at(recorded_T_keyframe[:, :3, 3], _recorded_T_keyframe(before), before.odom_T_keyframe)
+    return PathAlignment(odom_T_keyframe[:, :3, 3], map_T_recorded @ recorded_T_keyframe @ invert(odom_T_keyframe))
+
+
+def recorded_T_map(point_map: PointMap, places_odom: Float64Array) -> Float64Array:
+    """Return the (N, 4, 4) transforms from a map's frame into that of its recorded odometry at (N, 3) places."""
+    if point_map.recorded_T_sensor is None:
+        return np.repeat(np.eye(4)[None], len(places_odom), axis=0)
+    return _transforms_at(places_odom, point_map.odom_T_keyframe, _recorded_T_keyframe(point_map))
+
+
+def _recorded_T_keyframe(point_map: PointMap) -> Float64Array:
+    """Return the (K, 4, 4) recorded pose of each keyframe."""
+    if point_map.recorded_T_sensor is None:
+        return point_map.odom_T_keyframe
+    return point_map.recorded_T_sensor[point_map.keyframe_scans]
+
+
+def _transforms_at(places: Float64Array, src_T_keyframe: Float64Array, dst_T_keyframe: Float64Array) -> Float64Array:
+    """Return the (N, 4, 4) dst_T_src at (N, 3) places of frame src."""
+    nearest = np.asarray(cKDTree(src_T_keyframe[:, :3, 3]).query(places.reshape(-1, 3))[1], dtype=np.int64)
+    return np.asarray(dst_T_keyframe[nearest] @ invert(src_T_keyframe[nearest]))
+
+
+def _move_regions(regions: ChangeRegions, dst_T_src: Float64Array) -> ChangeRegions:
+    return replace(regions, centres_map=transform_each(dst_T_src, regions.centres_map))
+
+
+def _move_surface(surface: SurfaceField, before: PointMap) -> SurfaceField:
+    """Return a field in the frame of the recorded odometry; each point moves with its nearest keyframe."""
+    centres = np.array([each.centre_map for each in surface.regions]).reshape(-1, 3)
+    moved = transform_each(recorded_T_map(before, centres), centres)
+    recorded = recorded_T_map(before, surface.points_map)
+    return replace(
+        surface,
+        points_map=transform_each(recorded, surface.points_map),
+        normals_map=np.einsum("nij,nj->ni", recorded[:, :3, :3], surface.normals_map),
+        regions=tuple(replace(each, centre_map=at) for each, at in zip(surface.regions, moved, strict=True)),
+    )
+
+
+def _move_objects(objects: tuple[ChangedObject, ...], before: PointMap) -> list[ChangedObject]:
+    middles = np.array([each.points_map.mean(axis=0) for each in objects]).reshape(-1, 3)
+    shifts = transform_each(recorded_T_map(before, middles), middles) - middles
+    moved = []
+    for item, shift in zip(objects, shifts, strict=True):
+        shape, displacement = item.shape, item.displacement_map
+        if shape is not None:
+            map_T_box = shape.map_T_box.copy()
+            map_T_box[:3, 3] += shift
+            shape = replace(shape, map_T_box=map_T_box)
+        if displacement is not None:
+            to_after = shifts[item.partner] - shift
+            displacement = displacement + (to_after if item.session == "before" else -to_after)
+        moved.append(replace(item, points_map=item.points_map + shift, shape=shape, displacement_map=displacement))
+    return moved

@@ -1,0 +1,179 @@
+"""Registration of one scan with the map of others, point to plane, with poses that the odometry predicts as prior."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import small_gicp
+from scipy.spatial.transform import Rotation
+
+from cdpipe.core.geometry import Float64Array, Int64Array, invert, make_pose, plane_jacobian, transform, travelled_m
+from cdpipe.core.geometry.voxel import cell_keys
+from cdpipe.core.spooled import SpooledArray
+from cdpipe.model.types import ScanSource
+
+# Points nearer than this are used: farther ones carry more of the rotation's error than of the walls.
+_REACH_M = 20.0
+# One point per cell of a scan makes the map, and one per larger cell is registered with it.
+_MAP_CELL_M, _SCAN_CELL_M = 0.2, 0.6
+_NEIGHBOURS = 10
+# Standard deviation of a point's distance to its plane, and its correlation with its neighbours is in here, too.
+_POINT_M = 0.05
+# A sensor that stands sees one place in all its scans; more of them tell nothing new and take 1 MB each.
+_MOST_SCANS = 200
+_STEPS, _CONVERGED = 4, 2e-4
+# Noise of the normals alone makes information along a smooth drift, a small share of that across it (validation: 0.002
+# to 0.011; rough drifts 0.012 to 0.33). Nothing counts up to this share, and all from twice as much.
+_NOISE_SHARE = 0.006
+MIN_PAIRS = 50
+# A point at this distance from the planes of a map is not on its walls.
+_OFF_WALLS_M = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """Settings of a registration.
+
+    Attributes:
+        voxel_m: Cell of the map.
+        correspondence_m: Longest correspondence.
+        robust_m: Scale of the robust weight, 1 / (1 + (d / robust_m)^2)^2.
+        step_m: Standard deviation of the odometry from scan to scan.
+        step_rad: The same of its rotation.
+    """
+
+    voxel_m: float
+    correspondence_m: float
+    robust_m: float
+    step_m: float
+    step_rad: float
+
+
+class Samples:
+    """Points of every scan, in its sensor frame, and the recorded path."""
+
+    def __init__(self, source: ScanSource) -> None:
+        self.recorded = source.odom_T_sensor
+        self.path_m = travelled_m(self.recorded)
+        of_map, of_scan = SpooledArray(np.float32, (3,)), SpooledArray(np.float32, (3,))
+        sizes = []
+        for scan in source.scans():
+            points = scan.points_sensor[np.einsum("ij,ij->i", scan.points_sensor, scan.points_sensor) < _REACH_M**2]
+            parts = [_first_per_cell(points, cell_m) for cell_m in (_MAP_CELL_M, _SCAN_CELL_M)]
+            for part, spooled in zip(parts, (of_map, of_scan), strict=True):
+                spooled.append(part)
+            sizes.append([len(part) for part in parts])
+        self._points = of_map.finish(), of_scan.finish()
+        self._offsets = np.concatenate([np.zeros((1, 2), np.int64), np.cumsum(sizes, axis=0)])
+
+    def of_map(self, index: int) -> Float64Array:
+        """Return the (N, 3) points that a scan adds to a map."""
+        return self._part(0, index)
+
+    def of_scan(self, index: int) -> Float64Array:
+        """Return the (N, 3) points that are registered."""
+        return self._part(1, index)
+
+    def _part(self, kind: int, index: int) -> Float64Array:
+        start, end = self._offsets[index : index + 2, kind]
+        return self._points[kind][start:end].astype(np.float64)
+
+
+def spread(scans: Int64Array) -> Int64Array:
+    """Return (N,) scans, or 200 of them from the first to the last."""
+    n = len(scans)
+    return scans if n <= _MOST_SCANS else scans[np.linspace(0, n - 1, _MOST_SCANS).astype(np.int64)]
+
+
+def _first_per_cell(points: Float64Array, cell_m: float) -> Float64Array:
+    keys = cell_keys(points, cell_m)
+    # neighbours in a scan mostly share a cell, so sorting one key per run is faster
+    starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1])[: len(keys)])
+    _, first = np.unique(keys[starts], return_index=True)
+    return points.take(starts[np.sort(first)], axis=0)
+
+
+class Target:
+    """The map of some scans, 200 of them at most, about a (3,) centre, with a plane at every point.
+
+    Attributes:
+        centre: (3,) its origin in the odom frame: rotations are found about it.
+    """
+
+    def __init__(
+        self, scans: Samples, poses: Float64Array, chosen: Int64Array, centre: Float64Array, voxel_m: float
+    ) -> None:
+        self.centre = centre
+        self._voxel_m = voxel_m
+        chosen = spread(chosen)
+        cloud = np.concatenate([transform(poses[index], scans.of_map(index)) for index in chosen]) - centre
+        thinned, self._tree = small_gicp.preprocess_points(cloud, voxel_m, _NEIGHBOURS, num_threads=1)
+        self._points = np.ascontiguousarray(thinned.points()[:, :3])
+        self._normals = np.ascontiguousarray(thinned.normals()[:, :3])
+
+    def planes(self, points: Float64Array, within_m: float) -> tuple[Int64Array, Float64Array, Float64Array]:
+        """Return which of (N, 3) points have a plane, their (M,) signed distances, and the (M, 3) normals."""
+        nearest, squared_m2 = self._tree.batch_knn_search(points, 1)
+        chosen = np.flatnonzero(squared_m2[:, 0] < within_m**2)
+        nearest = nearest[chosen, 0].astype(np.int64)
+        normals = self._normals.take(nearest, axis=0)
+        offsets = points.take(chosen, axis=0) - self._points.take(nearest, axis=0)
+        distances_m = np.einsum("ij,ij->i", offsets, normals)
+        # what lies beyond the map's end would draw the scan back
+        is_over = squared_m2[chosen, 0] - distances_m**2 < self._voxel_m**2
+        return chosen[is_over], distances_m[is_over], normals[is_over]
+
+
+def register_scan(
+    points: Float64Array,
+    guess: Float64Array,
+    predicted: Sequence[Float64Array],
+    target: Target,
+    settings: Registration,
+) -> tuple[Float64Array, float]:
+    """Return the (4, 4) pose of a scan, and the share of its points that it leaves 0.1 m and more off the walls.
+
+    It is found by Gauss-Newton on the distances to planes and on the odometry.
+
+    Args:
+        points: (N, 3) points, sensor frame, metres.
+        guess: (4, 4) first pose, odom frame; it is the answer, with a share of 0, where too few points have a
+            counterpart.
+        predicted: (4, 4) poses that the odometry predicts from neighbours, one at least.
+        target: The map.
+        settings: Of the registration.
+    """
+    shift = make_pose(translation=-target.centre)
+    pose, priors = shift @ guess, invert(shift @ np.stack(predicted))
+    information = np.repeat([1 / settings.step_rad**2, 1 / settings.step_m**2], 3) / len(priors)
+    for _ in range(_STEPS):
+        chosen, distances_m, normals = target.planes(transform(pose, points), settings.correspondence_m)
+        if len(chosen) < MIN_PAIRS:
+            return guess, 0.0
+        jacobian = plane_jacobian(points.take(chosen, axis=0), normals @ pose[:3, :3])
+        weighted = jacobian / (_POINT_M * (1 + (distances_m / settings.robust_m) ** 2))[:, None] ** 2
+        told = _discount_normal_noise(weighted.T @ jacobian)
+        hessian, slope = told @ (weighted.T @ jacobian) @ told, told @ weighted.T @ distances_m
+        errors = priors @ pose
+        turns = Rotation.from_matrix(errors[:, :3, :3]).as_rotvec()  # one call: its checks take longer than its work
+        for error, turn in zip(errors, turns, strict=True):
+            residual = np.concatenate([turn, error[:3, 3]])
+            turned = np.eye(6)
+            turned[3:, 3:] = error[:3, :3]
+            hessian += (turned.T * information) @ turned
+            slope += (turned.T * information) @ residual
+        step = -np.linalg.solve(hessian, slope)
+        pose = pose @ make_pose(Rotation.from_rotvec(step[:3]).as_matrix(), step[3:])
+        if np.abs(step).max() < _CONVERGED:
+            break
+    return invert(shift) @ pose, float(np.mean(np.abs(distances_m) > _OFF_WALLS_M))
+
+
+def _discount_normal_noise(hessian: Float64Array) -> Float64Array:
+    """Return the (6, 6) shares of a motion that walls tell: none along a drift that the normals' noise alone tells."""
+    values, axes = np.linalg.eigh(hessian[3:, 3:])
+    told = np.eye(6)
+    told[3:, 3:] = axes * np.clip(values / (_NOISE_SHARE * values[-1]) - 1, 0, 1) @ axes.T
+    return told

@@ -1,0 +1,42 @@
+from .comparison import (
+    SOURCES_AT_KEYFRAMES,
+    WHOLE_MAP_SOURCES,
+    ClusterConfig,
+    ExtractConfig,
+    OutlierConfig,
+    QueryConfig,
+    RegionsConfig,
+)
+from .mapping import DescriptorConfig, MapConfig, MergeConfig, SphereConfig
+from .pipeline import OF_WHOLE_MAPS, PipelineConfig, setting_fields, settings_table
+from .presets import WEIGHTS, Site, load_config, preset_files, preset_names
+from .surface import SurfaceConfig
+from .whole_maps import ErasorConfig, M3C2Config, M3C2EPConfig, RangeNetConfig
+
+__all__ = [
+    "OF_WHOLE_MAPS",
+    "SOURCES_AT_KEYFRAMES",
+    "WEIGHTS",
+    "WHOLE_MAP_SOURCES",
+    "ClusterConfig",
+    "DescriptorConfig",
+    "ErasorConfig",
+    "ExtractConfig",
+    "M3C2Config",
+    "M3C2EPConfig",
+    "MapConfig",
+    "MergeConfig",
+    "OutlierConfig",
+    "PipelineConfig",
+    "QueryConfig",
+    "RangeNetConfig",
+    "RegionsConfig",
+    "Site",
+    "SphereConfig",
+    "SurfaceConfig",
+    "load_config",
+    "preset_files",
+    "preset_names",
+    "setting_fields",
+    "settings_table",
+]

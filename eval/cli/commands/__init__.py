@@ -1,0 +1,1 @@
+"""The commands of `tunnelcd`, a file for each group."""

@@ -1,0 +1,273 @@
+"""Commands about the installation: its speed, what it holds, and whether files are valid."""
+
+# ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from eval.cli.options import AsJson, JsonFile, Quiet, complete_any
+from eval.core.printing import LINE, MET, echo, line_width, print_table, require_json_file, tell_json
+
+
+def bench(
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE.json", help="also write the table", show_default=False)
+    ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="this row, axis or scenario only; may be repeated")
+    ] = None,
+    growth: Annotated[
+        bool, typer.Option("--growth", help="how time and memory grow with the input; also FILE.csv and FILE.png")
+    ] = False,
+    profile: Annotated[
+        bool, typer.Option("--profile", help="where the time of both paper sites goes, by stage; also FILE.md")
+    ] = False,
+    surface: Annotated[
+        bool, typer.Option("--surface", help="with --profile: displacement of the rock as well")
+    ] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="with --growth: sizes that show only that it runs")] = False,
+    large: Annotated[bool, typer.Option("--large", help="with --growth: up to 5 million points")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Measure the speed table, each figure beside its rival in the same run. A missed target is not an error."""
+    from eval.bench.bench import choose, list_contests, measure, require_writable
+    from eval.bench.growth import choose_axes, measure_growth, write_growth
+    from eval.bench.profile import SITES, measure_profile, write_markdown
+    from eval.core.progress import Lines, Silent
+
+    _require_one_table(growth=growth, profile=profile, surface=surface, quick=quick, large=large)
+    if out is not None:
+        require_writable(out)
+    # lines, never bars: the time of a thread that redraws bars would be measured as well
+    tell = (Silent() if quiet else Lines()).cells
+    written: list[Path] = []
+    if growth:
+        table = measure_growth(choose_axes(only or ()), quick=quick, large=large, on_progress=tell)
+        written = [] if out is None else write_growth(table, out)
+    elif profile:
+        table = measure_profile(only or SITES, has_surface=surface, on_progress=tell)
+        written = [] if out is None else [write_markdown(table, out)]
+    else:
+        table = measure(choose(list_contests(), only or ()), tell)
+    written = [*([] if out is None else [out]), *written]
+    tell_json(table, as_json=as_json, file=out)
+    show = _print_growth if growth else _print_profile if profile else _print_speed
+    if not quiet and not as_json:
+        show(table, written)
+
+
+def _require_one_table(*, growth: bool, profile: bool, surface: bool, quick: bool, large: bool) -> None:
+    """Refuse options of a table that is not asked for.
+
+    Raises:
+        InputError: Which one.
+    """
+    from cdpipe.core.errors import InputError
+
+    if growth and profile:
+        raise InputError("--growth and --profile: two tables: ask for one at a time")
+    if quick and large:
+        raise InputError("--quick and --large: name one of both")
+    for is_given, name, needed, needs in ((quick, "quick", growth, "growth"), (large, "large", growth, "growth"),
+                                          (surface, "surface", profile, "profile")):  # fmt: skip
+        if is_given and not needed:
+            raise InputError(f"--{name}: belongs to --{needs}: add it, or leave --{name} out")
+
+
+def _print_speed(table: dict[str, Any], written: list[Path]) -> None:
+    import pandas as pd
+
+    from eval.bench.bench import list_reasons, summarise
+
+    shown = pd.DataFrame(table["rows"]).assign(met=[MET[row["met"]] for row in table["rows"]]).drop(columns="reason")
+    print_table(f"speed, {_machine(table)}; ratio: times faster than the rival", shown)
+    echo(*list_reasons(table["rows"]), _with_files(summarise(table["rows"]), written))
+
+
+def _print_growth(table: dict[str, Any], written: list[Path]) -> None:
+    import pandas as pd
+
+    from eval.bench.growth import summarise_growth
+
+    shown = pd.DataFrame(table["rows"]).drop(columns=["axis", "n"])
+    print_table(f"growth, {_machine(table)}; figure = c * size ** exponent; low, high: 95 %; last: last step", shown)
+    echo(_with_files(summarise_growth(table), written))
+
+
+def _print_profile(table: dict[str, Any], written: list[Path]) -> None:
+    import pandas as pd
+
+    print_table(f"profile, {_machine(table)}; share: of the command's CPU time", pd.DataFrame(table["rows"]))
+    if written:
+        echo(_with_files("written", written))
+
+
+def _machine(table: dict[str, Any]) -> str:
+    return f"{table['machine']['cpu']}, {table['machine']['cores']} cores"
+
+
+def _with_files(told: str, written: list[Path]) -> str:
+    return "; ".join([told, *map(str, written)])
+
+
+def list_command(
+    what: Annotated[
+        Literal["scenarios", "props", "plans", "presets", "methods", "metrics", "sensors", "recordings", "settings"]
+        | None,
+        typer.Argument(help="this alone, with one-line descriptions; of settings with default and unit"),
+    ] = None,
+    as_json: AsJson = False,
+    out: JsonFile = None,
+) -> None:
+    """List scenarios, props, plans, presets, methods, metrics, sensors; or one of these, or the settings, described."""
+    from dataclasses import asdict
+
+    from eval.cli.listing import describe_entry, describe_setting, list_entries
+
+    require_json_file(out)
+    if what is None:
+        names = {title: [entry.name for entry in list_entries(kind)] for kind, title in _TITLES.items()}
+        tell_json({kind: names[title] for kind, title in _TITLES.items()}, as_json=as_json, file=out)
+        if as_json:
+            return
+        for title, of_kind in names.items():
+            echo(f"{title}:", *(f"  {name}" for name in of_kind))
+        return
+    columns = ["name", "default", "unit", "description"] if what == "settings" else ["name", "description"]
+    entries = list_entries(what)
+    tell_json([{column: asdict(entry)[column] for column in columns} for entry in entries], as_json=as_json, file=out)
+    if as_json:
+        return
+    for entry in entries:
+        echo(*(describe_setting(entry, LINE) if what == "settings" else [describe_entry(entry, entries, line_width())]))
+
+
+_TITLES = {
+    "scenarios": "scenarios",
+    "props": "props",
+    "plans": "plans",
+    "presets": "presets",
+    "methods": "methods",
+    "metrics": "metrics of plugins",
+    "sensors": "sensor profiles",
+    "recordings": "public recordings",
+}
+
+
+def doctor(as_json: AsJson = False, out: JsonFile = None) -> None:
+    """Print what is installed, whether it works, and how to repair what does not."""
+    from dataclasses import asdict
+
+    from cdpipe.core.errors import InputError
+    from eval.cli.doctor import examine, faults
+
+    require_json_file(out)
+    found = []
+    for each in examine():
+        found.append(each)
+        if not as_json:
+            echo(f"{each.what:<15} {each.state:<7} {each.told}")
+    tell_json([asdict(each) for each in found], as_json=as_json, file=out)
+    if wrong := faults(found):
+        raise InputError("\n".join(wrong))
+    if not as_json:
+        echo("all that is required works")
+
+
+def check(
+    files: Annotated[
+        list[str], typer.Argument(help="scenario, plan or preset: a name or a .yaml file", autocompletion=complete_any)
+    ],
+    as_json: AsJson = False,
+    out: JsonFile = None,
+) -> None:
+    """Validate scenarios, plans and presets without running anything."""
+    from cdpipe.core.errors import InputError
+
+    require_json_file(out)
+    mistakes: list[str] = []
+    rows: list[dict[str, object]] = []
+    for file in files:
+        found, own = "", []
+        try:
+            found = check_file(file)
+        except InputError as error:
+            own = str(error).split("\n")
+        mistakes += own
+        rows.append({"file": file, "is": found or None, "mistakes": own})
+        if found and not as_json:
+            echo(f"{file}: {found}, no mistakes")
+    tell_json(rows, as_json=as_json, file=out)
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+
+
+def check_file(name_or_path: str) -> str:
+    """Check a scenario, the meshes it names, a plan or a preset, and return its kind in words.
+
+    A file is of the kind with which it shares most keys, so that one misspelt key does not change its kind.
+
+    Raises:
+        InputError: It has mistakes (all of them at once), or it does not exist.
+    """
+    from cdpipe.core.errors import InputError
+    from cdpipe.core.yamlfile import read_yaml, suggest
+    from cdpipe.model.config import PipelineConfig, load_config, preset_names
+    from eval.plans.cells import expand_cells
+    from eval.plans.files import plan_names
+    from eval.plans.plan import Plan, load_plan
+    from scenarios import check_scenario, scenario_names
+    from scenarios.schema import Scenario
+
+    names = {"plan": plan_names(), "scenario": scenario_names(), "preset": preset_names()}
+    kind = next((kind for kind, known in names.items() if name_or_path in known), "")
+    if not kind:
+        if not name_or_path.endswith((".yaml", ".yml")):
+            near = suggest(name_or_path, [name for known in names.values() for name in known])
+            raise InputError(
+                f"{name_or_path}: no plan, scenario or preset of this name, and no .yaml file{near or '; see `list`'}"
+            )
+        keys = {
+            "preset": {*PipelineConfig.model_fields, "wide"},
+            "plan": set(Plan.model_fields),
+            "scenario": {*Scenario.model_fields, "extends", "frozen"},
+        }
+        content = read_yaml(Path(name_or_path)).value
+        own = set(content) if isinstance(content, dict) else set()
+        kind = max(keys, key=lambda name: len(own & keys[name]))
+    if kind == "plan":
+        return f"a plan of {len(expand_cells(load_plan(name_or_path)))} cells"
+    if kind == "scenario":
+        check_scenario(name_or_path)
+        _open_meshes(name_or_path)
+    else:
+        load_config(name_or_path)
+    return f"a {kind}"
+
+
+def _open_meshes(scenario: str) -> None:
+    """Read every mesh that a scenario names for one of the checked seeds, as `simulate` reads it.
+
+    Raises:
+        ScenarioError: Some cannot be used: one line each.
+    """
+    from cdpipe.core.errors import ScenarioError
+    from scenarios.library import CHECKED_SEEDS, load_scenario
+    from sim.rock.foreign import prop_mesh, tunnel_mesh
+
+    drawn = [load_scenario(scenario, seed) for seed in CHECKED_SEEDS]
+    tunnels = dict.fromkeys(each.tunnel.mesh for each in drawn if each.tunnel.mesh)
+    props = dict.fromkeys((prop.mesh, prop.name) for each in drawn for prop in each.props if prop.mesh)
+    mistakes = []
+    for read in [*(partial(tunnel_mesh, mesh) for mesh in tunnels), *(partial(prop_mesh, *prop) for prop in props)]:
+        try:
+            read()
+        except ScenarioError as error:
+            mistakes.append(f"{scenario}: {error}")
+    if mistakes:
+        raise ScenarioError("\n".join(mistakes))
