@@ -32,7 +32,7 @@ def input_errors() -> Iterator[None]:
     except OSError as error:
         if error.errno not in (*_DISK_ERRORS, *_NAME_ERRORS):
             raise
-        what = visible(f"{error.filename or 'the output'}: {error.strerror}")
+        what = visible(f"{error.filename2 or error.filename or 'the output'}: {error.strerror}")
         way = "name another one" if error.errno in _NAME_ERRORS else "give it a disk with room and leave to write"
         sys.stderr.write(f"error: {what}: {way}\n")
         raise SystemExit(2) from error

@@ -6,7 +6,7 @@ import errno
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -25,32 +25,33 @@ def new_folder(path: Path) -> Iterator[Path]:
         InputError: `path` is a file or a folder with something in it, or cannot be made.
     """
     made: list[Path] = []
+    partial: Path | None = None
     try:
         # a link to an empty folder, or to none yet, is that folder
         path = Path(os.path.realpath(path)) if path.is_symlink() else path.absolute()
         if path.is_symlink():
             raise InputError(f"{path}: is a link that leads to itself: name a folder you may write to")
-        partial = _partial_of(path)
+        hidden = _partial_of(path)
         made = _missing_parents(path)
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             what = "is not empty" if path.is_dir() else "is a file"
             raise InputError(f"{path}: {what}: name a new or empty folder for the output")
-        partial.parent.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir()
+        partial = hidden
+        _start(partial)
         if path.exists():
             _write_nothing(path)
-    except OSError as error:
-        _remove_empty(made)
-        raise unwritable(path, error) from error
+    except BaseException as error:
+        _clear(partial, made)
+        if isinstance(error, OSError):
+            raise unwritable(path, error) from error
+        raise
     try:
         yield partial
         if path.exists():
             path.rmdir()
         partial.replace(path)
     except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        _remove_empty(made)
+        _clear(partial, made)
         raise
 
 
@@ -91,18 +92,18 @@ def new_files(*paths: Path) -> Iterator[Path]:
             raise InputError(f"{path} exists already: name a new file or remove it")
     first = paths[0].absolute()
     with made_parents(first):
+        partial: Path | None = None
         try:
-            partial = _partial_of(first)
-            shutil.rmtree(partial, ignore_errors=True)
-            partial.mkdir()
-        except OSError as error:
-            raise unwritable(first, error) from error
-        try:
+            try:
+                partial = _partial_of(first)
+                _start(partial)
+            except OSError as error:
+                raise unwritable(first, error) from error
             yield partial
             for path in paths:
                 (partial / path.name).replace(path)
         finally:
-            shutil.rmtree(partial, ignore_errors=True)
+            _clear(partial, [])
 
 
 @contextmanager
@@ -137,6 +138,35 @@ def make_writable(path: Path) -> None:
         _write_nothing(path)
     except OSError as error:
         raise unwritable(path, error) from error
+
+
+def copy_folder(source: Path, target: Path, copy: Callable[[str, str], object] = shutil.copy2) -> None:
+    """Copy a folder with all that is in it, to a new folder or into one that is there.
+
+    Args:
+        source: The folder.
+        target: Where to; the folder above it exists.
+        copy: Copies or links one file.
+
+    Raises:
+        OSError: The first file that cannot be copied, with its number. `shutil.copytree` would go on after it.
+    """
+
+    def copy_or_end(file: str, place: str) -> None:
+        try:
+            copy(file, place)
+        except OSError as error:
+            raise _EndedError from error
+
+    try:
+        shutil.copytree(source, target, copy_function=copy_or_end, dirs_exist_ok=True)
+    except _EndedError as end:
+        assert isinstance(end.__cause__, OSError)
+        raise end.__cause__ from None
+
+
+class _EndedError(Exception):
+    """A copy of a folder ended; the cause is why."""
 
 
 def require_no_links(folder: Path) -> None:
@@ -200,6 +230,20 @@ def _partial_of(path: Path) -> Path:
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(path))
     name = f".{path.name}.partial"
     return path.with_name(name if len(os.fsencode(name)) <= _LONGEST_BYTES else f".{path_part(path.name)}.partial")
+
+
+def _start(partial: Path) -> None:
+    """Make an empty hidden folder in place of what a killed command left there, and the folders above it."""
+    partial.parent.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+
+
+def _clear(partial: Path | None, made: list[Path]) -> None:
+    """Remove a hidden folder, and the folders that were made above it."""
+    if partial is not None:
+        shutil.rmtree(partial, ignore_errors=True)
+    _remove_empty(made)
 
 
 def _write_nothing(folder: Path) -> None:

@@ -132,13 +132,14 @@ def pack_submission(run: RunFolder, name: str, out: Path) -> int:
     require_replaceable(out, _HEAD, "file of `tunnelcd submit`")
     evaluation = read_evaluation(run, name or _find_only(run))
     parts, answers = _collect(run, evaluation)
-    document = Submission(
-        name=evaluation.name, command=[_without_folders(word) for word in evaluation.command],
-        merge=evaluation.merge, limit_s=evaluation.limit_s,
-        programs={_without_folders(path): digest for path, digest in evaluation.programs.items()},
-        plan=evaluation.plan, split=evaluation.split, metrics_version=METRICS_VERSION, commit=git_commit(),
-        machine=machine(), versions=versions(), pairs=parts,
-    )  # fmt: skip
+    told = {
+        "name": evaluation.name, "command": [_without_folders(word) for word in evaluation.command],
+        "merge": evaluation.merge, "limit_s": evaluation.limit_s,
+        "programs": {_without_folders(path): digest for path, digest in evaluation.programs.items()},
+        "plan": evaluation.plan, "split": evaluation.split, "metrics_version": METRICS_VERSION, "commit": git_commit(),
+        "machine": machine(), "versions": versions(), "pairs": parts,
+    }  # fmt: skip
+    document = validate(Submission, Document(f"{run.path}: {evaluation.name}", told))
     try:
         with made_parents(out), whole_file(out) as partial, zipfile.ZipFile(partial, "w") as archive:
             _add(archive, _MANIFEST, json_text(document.model_dump()).encode())
@@ -242,12 +243,9 @@ def _collect(run: RunFolder, evaluation: EvaluationFile) -> tuple[list[PairPart]
             mistakes.append(f"{scenario} {seed} (simulated anew since)")
         else:
             files = {file: _describe(answer / file) for file in _FILES if (answer / file).is_file()}
-            parts.append(
-                PairPart.model_validate(
-                    {"scenario": scenario, "seed": seed, "pair_digest": call.pair_digest, "seconds": call.seconds,
-                     "row": cell["row"], "files": files}
-                )
-            )  # fmt: skip
+            part = {"scenario": scenario, "seed": seed, "pair_digest": call.pair_digest, "seconds": call.seconds,
+                    "row": cell["row"], "files": files}  # fmt: skip
+            parts.append(validate(PairPart, Document(f"{run.path}: {scenario} {seed}", part)))
             answers.append(answer)
     if mistakes:
         more = f" and {len(mistakes) - _TOLD} more" if len(mistakes) > _TOLD else ""

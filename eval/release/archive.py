@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import list_members, read_member, require_plain_file
 from cdpipe.core.names import LONGEST, visible
-from eval.core.output import new_folder, whole_file
+from eval.core.output import copy_folder, new_folder, whole_file
 from eval.core.progress import RunProgress, Silent
 
 SESSIONS, TRUTH, SUMS = "sessions", "truth", "SHA256SUMS"
@@ -128,7 +128,7 @@ def join_pair(folder: Path, name: str, out: Path) -> None:
             raise InputError(f"{part}: no such folder: name a pair of the release")
     with new_folder(out) as partial:
         for part in parts:
-            shutil.copytree(part, partial, dirs_exist_ok=True)
+            copy_folder(part, partial)
 
 
 def _place(name: str, *, with_truth: bool) -> str | None:

@@ -289,3 +289,21 @@ def test_places_that_cannot_be_written_are_one_line(
         code, out, err = command(*argv, "--out", tmp_path / f"{place}{suffix}", "--quiet")
         assert (code, out) == (2, "") and err.startswith("error: ") and err.count("\n") == 1
     assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(("key", "value"), [("seconds", 1e300), ("pair_digest", "x" * 1000)])
+def test_calls_that_cannot_be_are_one_line(run: RunFolder, tmp_path: Path, key: str, value: object) -> None:
+    (call,) = run.path.glob("evaluations/mine/smoke__unchanged/20000.json")
+    call.write_text(json.dumps({**json.loads(call.read_text()), key: value}))
+    with pytest.raises(InputError, match="smoke/unchanged 20000") as caught:
+        pack_submission(run, "mine", tmp_path / "x.zip")
+    assert "\n" not in str(caught.value) and not (tmp_path / "x.zip").exists()
+
+
+def test_an_evaluation_that_cannot_be_is_one_line(run: RunFolder, tmp_path: Path) -> None:
+    path = run.path / "evaluations" / "mine" / "evaluation.json"
+    document = json.loads(path.read_text())
+    path.write_text(json.dumps({**document, "split": "x" * 1000}))
+    with pytest.raises(InputError, match="split") as caught:
+        pack_submission(run, "mine", tmp_path / "x.zip")
+    assert "\n" not in str(caught.value) and not (tmp_path / "x.zip").exists()

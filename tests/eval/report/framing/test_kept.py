@@ -91,7 +91,9 @@ def test_a_page_that_cannot_be_read_is_refused_on_one_line(tmp_path: Path) -> No
     assert read_kept(tmp_path / "none.html").tables == {}
 
 
-@pytest.mark.parametrize("text", ["</td></tr></table>", "</table>", "<tr></tr>", "<td>x", "</figure></li></h2>", "<![foo[ x"])
+@pytest.mark.parametrize(
+    "text", ["</td></tr></table>", "</table>", "<tr></tr>", "<td>x", "</figure></li></h2>", "<![foo[ x"]
+)
 def test_a_page_with_tags_out_of_place_is_read_or_refused_on_one_line(tmp_path: Path, text: str) -> None:
     (tmp_path / "index.html").write_text(text)
     try:

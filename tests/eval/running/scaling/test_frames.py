@@ -66,7 +66,9 @@ def test_rows_follow_the_plan_and_not_the_names_of_folders(tmp_path: Path) -> No
     assert [("cab".index(row.scenario[0]), row.seed, 1 - int(row.variant[1])) for row in rows.itertuples()] == places
 
 
-@pytest.mark.parametrize("content", [b"[" * 200_000, b'{"a": 1, "order": [1e999, 1]}', b'{"order": [[], {}]}', b"\xff", b""])
+@pytest.mark.parametrize(
+    "content", [b"[" * 200_000, b'{"a": 1, "order": [1e999, 1]}', b'{"order": [[], {}]}', b"\xff", b""]
+)
 def test_a_file_that_is_no_cell_has_a_place_and_no_row(tmp_path: Path, content: bytes) -> None:
     run = RunFolder(tmp_path)
     path = run.cell("a/x", 1, "v")
