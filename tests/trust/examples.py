@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
@@ -98,11 +99,12 @@ def add_twin(folder: Path) -> None:
 
 def read_union(folder: Path) -> None:
     """Unite both, one of them as rows at a URL."""
-    rows = folder / "rows"
-    rows.mkdir()
-    Mirror(f"file://{folder / 'twin'}").fetch_all(rows)
-    merge_runs([folder / "run", rows], folder / "union", keep="answers")
-    merge_runs([folder / "run", folder / "twin"], folder / "whole")
+    with TemporaryDirectory() as place:
+        rows = Path(place) / "rows"
+        rows.mkdir()
+        Mirror(f"file://{folder / 'twin'}").fetch_all(rows)
+        merge_runs([folder / "run", rows], Path(place) / "union", keep="answers")
+        merge_runs([folder / "run", folder / "twin"], Path(place) / "whole")
 
 
 def make_evaluation(folder: Path) -> None:
