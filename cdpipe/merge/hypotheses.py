@@ -199,7 +199,7 @@ def judge(start: Start, maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
     evidence = {
         **start.evidence,
         "overlap": min(1.0, len(shared) / min(len(before.positions), len(after.positions))),
-        "inlier_share": fit.inlier_share(config.inlier_m),
+        "inlier_share": _usual_share(fit.inlier_share(config.inlier_m), fits),
         "residual_m": fit.residual_m,
         "hessian_ratio": _hessian_ratio(walked),
         "agreement": float(fits.mean()) if len(fits) >= _MIN_PLACES else float("nan"),
@@ -257,6 +257,15 @@ def _register_start(
         target, _ = before.target_near(there, _CHECK_RADIUS_M + config.vgicp_correspondence_m)
         pose = align_by_gicp(points, centre, target, pose, config.vgicp_correspondence_m, config.voxel_m)
     return pose, measure_fit(before, after, pose, sample_evenly(points), centre, _CHECK_RADIUS_M)
+
+
+def _usual_share(at_start: float, along: Float64Array) -> float:
+    """Return the inlier share at the start, or the median over all places of the walk if that is higher.
+
+    The tunnel may have changed at the start: fill or a pile that covers its floor leaves half of the points without a
+    counterpart, and says nothing about the alignment.
+    """
+    return max(at_start, float(np.median([at_start, *along]))) if len(along) >= _MIN_PLACES else at_start
 
 
 def _hessian_ratio(walked: Walk) -> float:

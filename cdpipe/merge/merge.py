@@ -52,11 +52,11 @@ def merge_maps(before: MappedSession, after: MappedSession, config: MergeConfig)
     """Align the after session with the before session from their descriptors and maps.
 
     Evidence: `overlap` (share of the shorter path within 5 m of the other), `inlier_share` and `residual_m` (share of
-    points within `inlier_m` of the other surface, and median distance, around the start), `hessian_ratio` (smallest to
-    largest eigenvalue of the translation's Hessian, whole path), `agreement` (mean inlier share along the path),
-    `distinctness` (residual of the best rival alignment divided by this one's; 10 without a rival),
-    `line_share` of a short path (`rings`), `descriptor_distance`, `n_hypotheses` walked, `is_fallback`, and
-    `kiss_matcher`: 1 if KISS-Matcher was asked, 0 if it was wanted and is not installed.
+    points within `inlier_m` of the other surface, and median distance, around the start; the share of the median place
+    of the walk if that is higher), `hessian_ratio` (smallest to largest eigenvalue of the translation's Hessian, whole
+    path), `agreement` (mean inlier share along the path), `distinctness` (residual of the best rival alignment divided
+    by this one's; 10 without a rival), `line_share` of a short path (`rings`), `descriptor_distance`, `n_hypotheses`
+    walked, `is_fallback`, and `kiss_matcher`: 1 if KISS-Matcher was asked, 0 if it was wanted and is not installed.
 
     Returns:
         The best hypothesis with the reason of a refusal; the identity if nothing could be registered.

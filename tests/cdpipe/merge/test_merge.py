@@ -15,8 +15,9 @@ from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transf
 from cdpipe.io.ply import read_ply_points
 from cdpipe.merge import merge
 from cdpipe.merge.candidates import first_keyframes
-from cdpipe.merge.evidence import explain_refusal
+from cdpipe.merge.evidence import explain_refusal, measure_fit
 from cdpipe.merge.global_registration import is_kiss_matcher_installed
+from cdpipe.merge.hypotheses import Start, judge
 from cdpipe.merge.merge import merge_maps, take_known_merge
 from cdpipe.merge.registration import IndexedMap, register
 from cdpipe.model.config import MergeConfig, load_config
@@ -154,6 +155,22 @@ def test_maps_that_bend_apart_are_aligned_along_the_path(
     rigid_m = np.linalg.norm(transform(merged.before_T_after, path) - true_path, axis=1)
     assert rigid_m.max() > 0.1
     assert np.percentile(errors_m, 95) < 0.05
+
+
+def test_a_start_where_the_tunnel_was_filled_up_is_judged_by_the_rest_of_the_path(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array
+) -> None:
+    points, start = tunnel_after.map.points.copy(), len(tunnel_after.map.keyframe_scans) // 2
+    centre = tunnel_after.map.odom_T_keyframe[start, :3, 3]
+    is_near = np.linalg.norm(points - centre, axis=1) < 5.5
+    floor_m = transform(AFTER_ODOM_T_WORLD, np.zeros((1, 3)))[0, 2]
+    points[is_near & (points[:, 2] < floor_m + 1.0), 2] += 0.7
+    filled = replace(tunnel_after.map, points=points)
+    maps = IndexedMap(tunnel_before.map, CONFIG, is_target=True), IndexedMap(filled, CONFIG, is_target=False)
+    at_start = measure_fit(*maps, true_before_T_after, points[is_near], centre, 5.5).inlier_share(CONFIG.inlier_m)
+    assert at_start < 0.7
+    evidence = judge(Start(start, true_before_T_after, {}), maps, CONFIG).evidence
+    assert evidence["inlier_share"] > 0.9 and explain_refusal(evidence, CONFIG) == ""
 
 
 def test_frame_as_published_takes_whatever_it_finds(tunnel_before: MappedSession, other_tunnel: MappedSession) -> None:
