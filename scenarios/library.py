@@ -169,12 +169,19 @@ def _resolve_files(document: Document) -> tuple[dict[Any, Any], list[str]]:
     for key, name in file_keys(document.value):
         holder, colon, line = document.where(key).rpartition(":")
         path = Path(holder).parent / name if colon and line.isdigit() else Path(name)
-        is_there = path.exists() if key[0] == "recording" else path.is_file()
-        if not is_there:
+        if not _is_there(path, may_be_folder=key[:2] == ("recording", "sessions")):
             seen = "" if str(path) == name else f": expected {path}"
             missing.append(_format_mistake(document, key, f"no such file{seen}"))
         tree = _replace_at(tree, key, str(path))
     return tree, missing
+
+
+def _is_there(path: Path, *, may_be_folder: bool) -> bool:
+    """Tell whether a file or folder is there; pipes and devices, which would be waited for, and circles are none."""
+    try:
+        return path.is_file() or (may_be_folder and path.is_dir())
+    except OSError:  # a name that no file can have
+        return False
 
 
 def _replace_at(value: Any, key: Key, new: str) -> Any:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import Key
+from cdpipe.core.files import Key, require_plain_file
 from cdpipe.sensor.ouster import load_profile
 from scenarios.dangling import Mistake, items_at, mapping_at
 from scenarios.grafted import GraftScenario
@@ -64,6 +64,7 @@ def file_digests(scenario: Scenario) -> dict[str, str]:
 def _digest(path: Path) -> str:
     """Return the SHA-256 of a file; of a folder, which is a recording, of the names and digests of its files."""
     if not path.is_dir():
+        require_plain_file(path)
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     files = sorted(each for each in path.rglob("*") if each.is_file() and "truth" not in each.relative_to(path).parts)

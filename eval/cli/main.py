@@ -35,7 +35,8 @@ class _Funnel(TyperGroup):
                 return super().invoke(ctx)
         except KeyboardInterrupt as error:
             kept = _KEPT.get(ctx.invoked_subcommand or "")
-            told = f"finished {kept} are kept, the same command goes on from there" if kept else "nothing was written"
+            going_on = f"finished {kept} are kept, the same command goes on from there"
+            told = going_on if kept else "nothing half-written is left"
             sys.stderr.write(f"interrupted; {told}\n")
             raise typer.Exit(130) from error
 

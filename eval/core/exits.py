@@ -16,6 +16,8 @@ from eval.core.interrupts import interruptible
 
 # A full disk, a read-only one, a file too large for it, a folder or file of another user.
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EACCES, errno.EPERM)
+# A name that no file can have, or that is another's: of a folder, below a file, in a circle of links.
+_NAME_ERRORS = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR)
 
 
 @contextmanager
@@ -28,10 +30,11 @@ def input_errors() -> Iterator[None]:
             sys.stderr.write(f"error: {visible(line)}\n")
         raise SystemExit(2) from error
     except OSError as error:
-        if error.errno not in _DISK_ERRORS:
+        if error.errno not in (*_DISK_ERRORS, *_NAME_ERRORS):
             raise
-        what = visible(f"{error.filename or 'the output'}: {error.strerror}")
-        sys.stderr.write(f"error: {what}: give it a disk with room and leave to write\n")
+        what = visible(f"{error.filename2 or error.filename or 'the output'}: {error.strerror}")
+        way = "name another one" if error.errno in _NAME_ERRORS else "give it a disk with room and leave to write"
+        sys.stderr.write(f"error: {what}: {way}\n")
         raise SystemExit(2) from error
 
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.names import visible
+from cdpipe.core.names import path_part, visible
+
+_HEAD_BYTES = 1024
+_LONGEST_BYTES = 255  # of a name, which file systems take
 
 
 @contextmanager
@@ -20,39 +24,47 @@ def new_folder(path: Path) -> Iterator[Path]:
     Raises:
         InputError: `path` is a file or a folder with something in it, or cannot be made.
     """
-    # a link to an empty folder, or to none yet, is that folder
-    path = Path(os.path.realpath(path)) if path.is_symlink() else path.absolute()
-    if path.is_symlink():
-        raise InputError(f"{path}: is a link that leads to itself: name a folder you may write to")
-    partial = path.with_name(f".{path.name}.partial")
-    made = _missing_parents(path)
+    made: list[Path] = []
+    partial: Path | None = None
     try:
+        # a link to an empty folder, or to none yet, is that folder
+        path = Path(os.path.realpath(path)) if path.is_symlink() else path.absolute()
+        if path.is_symlink():
+            raise InputError(f"{path}: is a link that leads to itself: name a folder you may write to")
+        hidden = _partial_of(path)
+        made = _missing_parents(path)
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             what = "is not empty" if path.is_dir() else "is a file"
             raise InputError(f"{path}: {what}: name a new or empty folder for the output")
-        partial.parent.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir()
+        partial = hidden
+        _start(partial)
         if path.exists():
             _write_nothing(path)
-    except OSError as error:
-        _remove_empty(made)
-        raise unwritable(path, error) from error
+    except BaseException as error:
+        _clear(partial, made)
+        if isinstance(error, OSError):
+            raise unwritable(path, error) from error
+        raise
     try:
         yield partial
         if path.exists():
             path.rmdir()
         partial.replace(path)
     except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        _remove_empty(made)
+        _clear(partial, made)
         raise
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a hidden path that becomes `path` when the block succeeds, and is removed when it fails."""
-    partial = path.with_name(f".{path.name}.partial")
+    """Yield a hidden path that becomes `path` when the block succeeds, and is removed when it fails.
+
+    Raises:
+        OSError: The path is a folder, or nothing can be written there.
+    """
+    if path.is_dir() and not path.is_symlink():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    partial = _partial_of(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         partial.unlink(missing_ok=True)  # it may be a link, which a writer would follow
@@ -72,22 +84,26 @@ def new_files(*paths: Path) -> Iterator[Path]:
         InputError: A path exists, or they cannot be made. They lie in one folder.
     """
     for path in paths:
-        if path.exists() or path.is_symlink():
+        try:
+            is_there = path.exists() or path.is_symlink()
+        except OSError as error:
+            raise unwritable(path, error) from error
+        if is_there:
             raise InputError(f"{path} exists already: name a new file or remove it")
     first = paths[0].absolute()
-    partial = first.with_name(f".{first.name}.partial")
     with made_parents(first):
+        partial: Path | None = None
         try:
-            shutil.rmtree(partial, ignore_errors=True)
-            partial.mkdir()
-        except OSError as error:
-            raise unwritable(first, error) from error
-        try:
+            try:
+                partial = _partial_of(first)
+                _start(partial)
+            except OSError as error:
+                raise unwritable(first, error) from error
             yield partial
             for path in paths:
                 (partial / path.name).replace(path)
         finally:
-            shutil.rmtree(partial, ignore_errors=True)
+            _clear(partial, [])
 
 
 @contextmanager
@@ -97,8 +113,9 @@ def made_parents(path: Path) -> Iterator[None]:
     Raises:
         InputError: They cannot be made.
     """
-    made = _missing_parents(path.absolute())
+    made: list[Path] = []
     try:
+        made = _missing_parents(path.absolute())
         path.absolute().parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         _remove_empty(made)
@@ -123,6 +140,35 @@ def make_writable(path: Path) -> None:
         raise unwritable(path, error) from error
 
 
+def copy_folder(source: Path, target: Path, copy: Callable[[str, str], object] = shutil.copy2) -> None:
+    """Copy a folder with all that is in it, to a new folder or into one that is there.
+
+    Args:
+        source: The folder.
+        target: Where to; the folder above it exists.
+        copy: Copies or links one file.
+
+    Raises:
+        OSError: The first file that cannot be copied, with its number. `shutil.copytree` would go on after it.
+    """
+
+    def copy_or_end(file: str, place: str) -> None:
+        try:
+            copy(file, place)
+        except OSError as error:
+            raise _EndedError from error
+
+    try:
+        shutil.copytree(source, target, copy_function=copy_or_end, dirs_exist_ok=True)
+    except _EndedError as end:
+        assert isinstance(end.__cause__, OSError)
+        raise end.__cause__ from None
+
+
+class _EndedError(Exception):
+    """A copy of a folder ended; the cause is why."""
+
+
 def require_no_links(folder: Path) -> None:
     """Refuse a folder with a link in it: what is written, replaced or removed below the folder would lie elsewhere.
 
@@ -138,6 +184,29 @@ def require_no_links(folder: Path) -> None:
                 )
 
 
+def require_replaceable(path: Path, mark: bytes, what: str) -> None:
+    """Refuse a file that exists and is not what the caller wrote there earlier: it would be lost.
+
+    Args:
+        path: The output.
+        mark: What stands within the first kilobyte of each such file.
+        what: What such a file is, for the message: "page of `tunnelcd leaderboard`".
+
+    Raises:
+        InputError: It is another's, or cannot be looked at.
+    """
+    try:
+        if not path.exists():
+            return
+        if path.is_file():
+            with path.open("rb") as file:
+                if mark in file.read(_HEAD_BYTES):
+                    return
+    except OSError as error:
+        raise unwritable(path, error) from error
+    raise InputError(f"{path}: exists, and is no {what}: name a new file, or remove it")
+
+
 def remove(path: Path) -> None:
     """Remove a file, a folder, or a link but not what it leads to, if it is there."""
     if path.is_dir() and not path.is_symlink():
@@ -149,6 +218,32 @@ def remove(path: Path) -> None:
 def unwritable(path: Path, error: OSError) -> InputError:
     """Return the error that says why an output folder cannot be used."""
     return InputError(f"{path}: cannot write there ({error.strerror}): name a folder you may write to")
+
+
+def _partial_of(path: Path) -> Path:
+    """Return the hidden name beside a path under which it is written first; of a long name it holds a part.
+
+    Raises:
+        OSError: The path's own name is too long.
+    """
+    if len(os.fsencode(path.name)) > _LONGEST_BYTES:
+        raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(path))
+    name = f".{path.name}.partial"
+    return path.with_name(name if len(os.fsencode(name)) <= _LONGEST_BYTES else f".{path_part(path.name)}.partial")
+
+
+def _start(partial: Path) -> None:
+    """Make an empty hidden folder in place of what a killed command left there, and the folders above it."""
+    partial.parent.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+
+
+def _clear(partial: Path | None, made: list[Path]) -> None:
+    """Remove a hidden folder, and the folders that were made above it."""
+    if partial is not None:
+        shutil.rmtree(partial, ignore_errors=True)
+    _remove_empty(made)
 
 
 def _write_nothing(folder: Path) -> None:

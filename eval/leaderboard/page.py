@@ -11,6 +11,7 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.core.errors import InputError
+from eval.core.output import made_parents, require_replaceable
 from eval.core.printing import count_pairs
 from eval.leaderboard.comparison import (
     FIGURES,
@@ -28,6 +29,7 @@ from eval.leaderboard.submission import CheckedFile
 from eval.report.render import render_page, write_file
 from eval.running.results.run_data import RunData
 
+_HEAD = b"<title>tunnelcd: leaderboard</title>"
 _MERGES = {"own": "its own", "given": "told the true one", "ours": "told tunnelcd's"}
 
 
@@ -70,6 +72,7 @@ def write_leaderboard(files: Sequence[CheckedFile], out: Path, reference: Path |
     """
     if out.suffix != ".html" or out.is_dir():
         raise InputError(f"--out {out}: expected the name of a file that ends in .html")
+    require_replaceable(out, _HEAD, "page of `tunnelcd leaderboard`")
     boards = [_make_board(group, reference) for group in _group(files)]
     told = [
         {"name": each.content.name, "file": each.path.name, "sha256": each.sha256, "content": each.content,
@@ -80,8 +83,8 @@ def write_leaderboard(files: Sequence[CheckedFile], out: Path, reference: Path |
     columns = [SHOWN[key] for key in FIGURES]
     headings = ("method", "merge", "pairs", *HEADINGS)
     content = {"boards": boards, "headings": headings, "files": told, "columns": columns}
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_file(out, render_page("leaderboard.html", content))
+    with made_parents(out):
+        write_file(out, render_page("leaderboard.html", content))
 
 
 def _group(files: Sequence[CheckedFile]) -> list[list[CheckedFile]]:

@@ -27,7 +27,7 @@ from cdpipe.core.files import list_members, parse_json, read_bytes, read_member,
 from cdpipe.core.names import LONGEST, visible
 from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.io.answer_parts import MAX_ERROR
-from eval.core.output import made_parents, whole_file
+from eval.core.output import made_parents, require_replaceable, unwritable, whole_file
 from eval.core.provenance import git_commit, machine, versions
 from eval.leaderboard.evaluation import EvaluationFile, digest_method, digest_pair, read_call, read_evaluation
 from eval.leaderboard.given_merge import MergeMode
@@ -38,6 +38,7 @@ from eval.scoring.scoring import METRICS_VERSION, score_stored
 from eval.truth.ground_truth import load_ground_truth
 
 _MANIFEST = "submission.json"
+_HEAD = _MANIFEST.encode()  # the name of the first member stands near the start of the file
 _FILES = ("answer.json", "answer.npz")
 _MOST_BYTES = 4 << 30
 _EXPECTED = "expected a file of `tunnelcd submit`: ask for it again"
@@ -128,20 +129,25 @@ def pack_submission(run: RunFolder, name: str, out: Path) -> int:
     """
     if out.suffix != ".zip" or out.is_dir():
         raise InputError(f"--out {out}: expected the name of a new file that ends in .zip")
+    require_replaceable(out, _HEAD, "file of `tunnelcd submit`")
     evaluation = read_evaluation(run, name or _find_only(run))
     parts, answers = _collect(run, evaluation)
-    document = Submission(
-        name=evaluation.name, command=[_without_folders(word) for word in evaluation.command],
-        merge=evaluation.merge, limit_s=evaluation.limit_s,
-        programs={_without_folders(path): digest for path, digest in evaluation.programs.items()},
-        plan=evaluation.plan, split=evaluation.split, metrics_version=METRICS_VERSION, commit=git_commit(),
-        machine=machine(), versions=versions(), pairs=parts,
-    )  # fmt: skip
-    with made_parents(out), whole_file(out) as partial, zipfile.ZipFile(partial, "w") as archive:
-        _add(archive, _MANIFEST, json_text(document.model_dump()).encode())
-        for number, answer in enumerate(answers):
-            for file in parts[number].files:
-                _add(archive, _member(number, file), (answer / file).read_bytes())
+    told = {
+        "name": evaluation.name, "command": [_without_folders(word) for word in evaluation.command],
+        "merge": evaluation.merge, "limit_s": evaluation.limit_s,
+        "programs": {_without_folders(path): digest for path, digest in evaluation.programs.items()},
+        "plan": evaluation.plan, "split": evaluation.split, "metrics_version": METRICS_VERSION, "commit": git_commit(),
+        "machine": machine(), "versions": versions(), "pairs": parts,
+    }  # fmt: skip
+    document = validate(Submission, Document(f"{run.path}: {evaluation.name}", told))
+    try:
+        with made_parents(out), whole_file(out) as partial, zipfile.ZipFile(partial, "w") as archive:
+            _add(archive, _MANIFEST, json_text(document.model_dump()).encode())
+            for number, answer in enumerate(answers):
+                for file in parts[number].files:
+                    _add(archive, _member(number, file), (answer / file).read_bytes())
+    except OSError as error:
+        raise unwritable(out, error) from error
     return len(parts)
 
 
@@ -237,12 +243,9 @@ def _collect(run: RunFolder, evaluation: EvaluationFile) -> tuple[list[PairPart]
             mistakes.append(f"{scenario} {seed} (simulated anew since)")
         else:
             files = {file: _describe(answer / file) for file in _FILES if (answer / file).is_file()}
-            parts.append(
-                PairPart.model_validate(
-                    {"scenario": scenario, "seed": seed, "pair_digest": call.pair_digest, "seconds": call.seconds,
-                     "row": cell["row"], "files": files}
-                )
-            )  # fmt: skip
+            part = {"scenario": scenario, "seed": seed, "pair_digest": call.pair_digest, "seconds": call.seconds,
+                    "row": cell["row"], "files": files}  # fmt: skip
+            parts.append(validate(PairPart, Document(f"{run.path}: {scenario} {seed}", part)))
             answers.append(answer)
     if mistakes:
         more = f" and {len(mistakes) - _TOLD} more" if len(mistakes) > _TOLD else ""

@@ -10,18 +10,19 @@ import hashlib
 import re
 import shutil
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import list_members, read_member, require_plain_file
-from cdpipe.core.names import visible
-from eval.core.output import new_folder, whole_file
+from cdpipe.core.names import LONGEST, visible
+from eval.core.output import copy_folder, new_folder, whole_file
 from eval.core.progress import RunProgress, Silent
 
 SESSIONS, TRUTH, SUMS = "sessions", "truth", "SHA256SUMS"
 _MOST_BYTES = 4 << 30
+_LONGEST_NAME = 1000  # with folders; systems take paths of 4096 bytes
 _LINE = re.compile(r"([0-9a-f]{64})  ([\w.-]+(?:/[\w.-]+)*)")
 _NAME = re.compile(r"(sessions|truth)/([0-9a-f]{16})/(.+)")
 _EXPECTED = "expected a file made by `tunnelcd dataset --release`, copy it again"
@@ -127,7 +128,7 @@ def join_pair(folder: Path, name: str, out: Path) -> None:
             raise InputError(f"{part}: no such folder: name a pair of the release")
     with new_folder(out) as partial:
         for part in parts:
-            shutil.copytree(part, partial, dirs_exist_ok=True)
+            copy_folder(part, partial)
 
 
 def _place(name: str, *, with_truth: bool) -> str | None:
@@ -156,7 +157,27 @@ def _parse_sums(content: bytes, source: str) -> dict[str, str]:
         if parts is None or {".", ".."} & set(parts[2].split("/")):
             raise InputError(f"{source}:{number}: expected a SHA-256 and the name of a file: copy the release again")
         found[parts[2]] = parts[1]
+    _require_files(found, source)
     return found
+
+
+def _require_files(names: Collection[str], source: str) -> None:
+    """Refuse names that cannot all be files of one folder, also where the disk takes upper and lower case as one.
+
+    Raises:
+        InputError: A name is too long, one is another's folder, or two are one name.
+    """
+    folders = {parent.as_posix().casefold() for name in names for parent in PurePosixPath(name).parents}
+    seen = set()
+    for name in names:
+        way = f"{source}: {visible(name):.100}"
+        if len(name) > _LONGEST_NAME or any(len(part.encode()) > LONGEST for part in name.split("/")):
+            raise InputError(f"{way}: longer than a file's name can be: copy the release again")
+        if name.casefold() in folders:
+            raise InputError(f"{way}: a file and a folder of one name: copy the release again")
+        if name.casefold() in seen:
+            raise InputError(f"{way}: stands twice: copy the release again")
+        seen.add(name.casefold())
 
 
 @contextmanager

@@ -11,6 +11,7 @@ is finished and kept: its name is a digest of all that it is made of except code
 
 from __future__ import annotations
 
+import re
 import shutil
 import time
 from collections.abc import Iterator, Sequence
@@ -22,7 +23,7 @@ from pydantic import TypeAdapter
 
 from cdpipe.core.errors import InputError, ScenarioError
 from eval.core.cluster import HERE, Where, connected, require_usable
-from eval.core.output import made_parents, make_writable, remove, whole_file
+from eval.core.output import made_parents, make_writable, remove, require_no_links, whole_file
 from eval.core.progress import RunProgress, Silent
 from eval.release.archive import SESSIONS, SUMS, TRUTH, list_files, pack, read_sums, write_sums
 from eval.release.card import write_release_card
@@ -34,6 +35,7 @@ from scenarios.schema import Scenario
 from sim.session.simulate import simulate_pair
 
 _SCRATCH = ".making-"
+_LEFT = re.compile(r"\.making-[a-z0-9_]{8}")  # as `tempfile` goes on
 _OWN = {"README.md", FILE, SUMS, SESSIONS, TRUTH}
 _Task = tuple[str, str, int, Scenario]
 _TASK: TypeAdapter[_Task] = TypeAdapter(_Task)
@@ -86,6 +88,8 @@ def make_release(
     if is_file and (out.exists() or out.is_symlink()):
         raise InputError(f"{out}: exists already: name a new file, or remove it")
     folder = out.with_name(f"{out.name}.parts") if is_file else out
+    if is_file and folder.is_symlink():
+        raise InputError(f"{folder}: is a link, and this folder is removed in the end: remove the link")
     with made_parents(out), removed_if_empty(folder):
         _take_folder(folder, release)
         missing = [pair for pair in release.pairs if not _is_finished(folder, pair)]
@@ -142,8 +146,10 @@ def _keep_truth(whole: Path, sessions: Path) -> None:
 def _take_folder(folder: Path, release: Release) -> None:
     """Make the folder, or check that it is of this release, and remove what a killed run left."""
     make_writable(folder)
+    require_no_links(folder)
     for left in folder.glob(f"{_SCRATCH}*"):
-        shutil.rmtree(left, ignore_errors=True)
+        if _LEFT.fullmatch(left.name):
+            shutil.rmtree(left, ignore_errors=True)
     here = {path.name for path in folder.iterdir()} - _OWN
     names = {pair.name for pair in release.pairs}
     for kind in (SESSIONS, TRUTH):

@@ -14,7 +14,6 @@ from __future__ import annotations
 import hashlib
 import os
 import secrets
-import shutil
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -26,7 +25,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_json
 from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.io.session import SessionWriter, read_session
-from eval.core.output import make_writable, new_folder
+from eval.core.output import copy_folder, make_writable, new_folder
 from eval.core.progress import RunProgress, Silent
 from eval.running.rescoring import foreign_identity
 from eval.running.runfolder import RunFolder, write_json
@@ -88,7 +87,7 @@ def export_with_truth(run: RunFolder, out: Path, progress: RunProgress | None = 
         there = out / name / _CHANGES
         if there.is_file() and there.read_bytes() != (pair / _CHANGES).read_bytes():
             raise InputError(f"{out / name}: an earlier simulation of this pair: name a new folder")
-    return _export(out, names, partial(shutil.copytree, dirs_exist_ok=True), progress or Silent())
+    return _export(out, names, copy_folder, progress or Silent())
 
 
 def list_pairs(run: RunFolder) -> list[Path]:

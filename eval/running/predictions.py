@@ -22,7 +22,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.names import folded, require_table_name, visible
 from cdpipe.core.yamlfile import suggest
 from cdpipe.model.config import preset_names
-from eval.core.output import remove
+from eval.core.output import copy_folder, remove
 from eval.core.progress import RunProgress, Silent
 from eval.core.tablefile import read_table
 from eval.plans.cells import list_planned_cases
@@ -109,7 +109,7 @@ def evaluate(predict: Callable[[Path, Path], object], run: Path | str, name: str
             answer.mkdir()
             copy_pair(original, pair)
             predict(pair, answer)
-            shutil.copytree(answer, answers / original.parent.name / original.name)
+            copy_folder(answer, answers / original.parent.name / original.name)
             remove(pair)
             remove(answer)
         add_predictions(folder, answers, name)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform, travelled_m
-from cdpipe.core.geometry.voxel import thin
+from cdpipe.core.geometry.voxel import require_reachable, thin
 from sim.graft.part import Part, world_points
 
 _CELL_M = 0.07  # one return of each cell is kept
@@ -90,11 +90,17 @@ def _surrounds(local: Float64Array) -> bool:
 
 
 def _gather(part: Part, reach_m: float) -> Float64Array:
-    """Return the thinned returns (N, 3) of a part within some distance of the sensor."""
+    """Return the thinned returns (N, 3) of a part within some distance of the sensor.
+
+    Raises:
+        InputError: The part is too far from its origin.
+    """
     way_m = travelled_m(part.odom_T_sensor)
     steps = np.floor(way_m / _SCAN_EVERY_M).astype(np.int64)
     chosen = np.flatnonzero(_starts(steps)) if steps[-1] > 20 else np.arange(len(steps))
     chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, min(_MOST_SCANS, len(chosen))).astype(np.int64))]
+    farthest_m = float(np.abs(part.world_T_sensor[:, :3, 3]).max(initial=0.0)) + 2 * reach_m
+    require_reachable(str(part.source.path), farthest_m, _CELL_M)
     kept, pending = np.zeros((0, 3)), []
     for revolution in part.revolutions(chosen):
         points = world_points(part, revolution)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 from pydantic import TypeAdapter
 
-from cdpipe.core.errors import ScenarioError
+from cdpipe.core.errors import InputError, ScenarioError
 from eval.running.pair_run import Pair
 from scenarios.grafted import GraftScenario
 from scenarios.library import check_scenario, load_grafted, load_scenario
@@ -105,3 +106,22 @@ def test_a_file_with_a_recording_gives_no_props_to_another(tmp_path: Path) -> No
     path = write(tmp_path, "recording: {sessions: [drive.osf]}\n")
     with pytest.raises(ScenarioError, match=r"real.yaml:1: recording: the file names its own"):
         load_grafted(path, {"sessions": [path]}, 3)
+
+
+@pytest.mark.parametrize("name", ["pipe", "zeros", "circle", "x" * 300, f"drive.osf/{'x' * 300}"])
+@pytest.mark.parametrize("key", ["sessions: [{}]", "sessions: [drive.osf, .], before_T_after: {}"])
+def test_what_would_be_waited_for_is_no_file(tmp_path: Path, key: str, name: str) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "zeros").symlink_to("/dev/zero")
+    (tmp_path / "circle").symlink_to("circle")
+    path = write(tmp_path, f"recording: {{{key.format(name)}}}\n")
+    with pytest.raises(ScenarioError, match=r"real.yaml:1: recording\..*: no such file"):
+        load_scenario(path, 3)
+
+
+def test_a_file_that_becomes_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    drawn = load_scenario(write(tmp_path, "recording: {sessions: [drive.osf]}\n"), 3)
+    (tmp_path / "drive.osf").unlink()
+    os.mkfifo(tmp_path / "drive.osf")
+    with pytest.raises(InputError, match=r"drive.osf: cannot be read \(it is a device or a pipe\)"):
+        file_digests(drawn)

@@ -518,7 +518,7 @@ def test_every_file_of_a_scenario_has_a_digest(tmp_path: Path) -> None:
     }
     assert file_digests(load_scenario("smoke/one_box", 0)) == {}
     (tmp_path / "mine.stl").unlink()
-    with pytest.raises(InputError, match=r"mine\.stl: cannot be read"):
+    with pytest.raises(InputError, match=r"mine\.stl: missing"):
         file_digests(scenario)
 
 

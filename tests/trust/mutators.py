@@ -466,6 +466,27 @@ def change_pcap(content: bytes, rng: random.Random) -> bytes:
     return bytes(data)
 
 
+def change_bag(content: bytes, rng: random.Random) -> bytes:
+    """Change numbers beside the name of a frame, which are stamps, poses and sizes of clouds; or the name itself."""
+    name = rng.choice((b"base_link", b"os_lidar", b"odom", b"map"))
+    places = [found.start() for found in re.finditer(name, content)]
+    at = rng.choice(places)
+    data = bytearray(content)
+    kind = rng.randrange(4)
+    if kind == 0:
+        others = [other for other in (b"base_link", b"os_lidar", b"odom", b"map", b"../\x1b[2J<") if other != name]
+        data[at : at + len(name)] = rng.choice(others)[: len(name)].ljust(len(name), b"_")
+    elif kind == 1:
+        number = rng.choice(_NUMBERS) & 0xFFFFFFFF
+        start = max(0, at + rng.randrange(-24, 160))
+        data[start : start + 4] = number.to_bytes(4, "little")
+    else:
+        value = rng.choice((np.nan, np.inf, -np.inf, 1e300, -1e30, 1e-320, 0.0, 2.0))
+        start = at + len(name) + rng.randrange(80)
+        data[start : start + 8] = struct.pack("<d", value)
+    return bytes(data[: len(content)])
+
+
 def change_mesh_text(content: bytes, rng: random.Random) -> bytes:
     """Change a vertex or a face of an OBJ file, or add a line that the format knows."""
     line = rng.choice(
@@ -573,4 +594,6 @@ _BY_SUFFIX: dict[str, tuple[Mutator, ...]] = {
     "safetensors": (change_safetensors,),
     "osf": (change_osf,),
     "pcap": (change_pcap,),
+    "bag": (change_bag, change_bag, flip, overwrite),
+    "db3": (change_bag, change_bag, flip, overwrite),
 }

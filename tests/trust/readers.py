@@ -70,6 +70,7 @@ from sim.session.truth import read_labels
 from sim.story.state import SessionState, Story, dump_story, read_story
 from tests.eval.conftest import ODOM_T_WORLD, WIDTH, write_pair
 from tests.eval.leaderboard.conftest import Evaluator
+from tests.trust import examples
 
 ROOT = Path(__file__).parents[2]
 
@@ -565,6 +566,12 @@ def _read_scored(folder: Path) -> None:
     score_stored(load_ground_truth(folder / "pair"), folder / "answer")
 
 
+def _union(folder: Path) -> None:
+    _run(folder)
+    shutil.rmtree(folder / "answer")
+    examples.add_twin(folder)
+
+
 def _story(folder: Path) -> None:
     """Write the story of a scenario with a moved prop and two kinds of rock."""
     shutil.copy(ROOT / "scenarios" / "families" / "smoke" / "one_box.yaml", folder / "base.yaml")
@@ -588,6 +595,8 @@ _TRUTH = ("pair/truth/*", "pair/before/truth/*", "pair/*/session.json")
 _CELLS = ("run/cells/*/*/*.json", "run/provenance.json", "run/blind.json")
 _TABLES = ("run/results.csv", "run/*.csv.xz", "run/regions.csv", "run/provenance.json")
 _PAGE = ("run/*.csv", "run/*.csv.xz", "run/provenance.json", "run/maps/test/7.npz", "run/answers/*/*/*/*")
+_UNION = ("twin/cells/*/*/*.json", "twin/answers/*/*/*/*", "twin/provenance.json")
+_EVALUATED = ("run/evaluations/*/*.json", "run/evaluations/*/*/*.json", "run/cells/*/*/*.json", "run/results.csv")
 _SHARDS = ("*.safetensors", "index.csv")
 # The shares follow the time that a reader takes: 0.5 ms to 3 s an input.
 READERS: tuple[Reader, ...] = (
@@ -626,6 +635,19 @@ READERS: tuple[Reader, ...] = (
     Reader("ROS 1 bag", _foreign("write_bag", ".bag"), _read_foreign, ("r.bag",), 0.1, extra="rosbags"),
     Reader("ROS 2 bag", _foreign("write_bag", "2"), _read_foreign, ("r2/*",), 0.1, extra="rosbags"),
     Reader("MCAP", _foreign("write_bag", ".mcap"), _read_foreign, ("r.mcap",), 0.1, extra="mcap"),
+    Reader("worlds that move", examples.make_worlds, examples.read_worlds, ("*.yaml",), 0.2, lines=True),
+    Reader("props to graft", examples.make_objects, examples.read_objects, ("*.yaml",), 0.5, lines=True),
+    Reader("weights", examples.make_weights, examples.read_all_weights, ("*",), 0.3),
+    Reader("united runs", _union, examples.read_union, _UNION, 0.1, lines=True),
+    Reader("evaluated method", examples.make_evaluation, examples.read_evaluated, _EVALUATED, 0.3, lines=True),
+    Reader("answer on its maps", _scored, examples.read_answer_page, ("answer/*",), 0.1, lines=True),
+    Reader("whole map", examples.make_map, examples.read_map, ("m.ply",), 0.2),
+    Reader("mesh to trace", examples.make_drift, examples.read_drift, ("*",), 0.02),
+    Reader("pages and index of reports", examples.make_pages, examples.read_pages, ("reports/*", "reports/*/*"), 0.5),
+    Reader(
+        "content of a release", examples.make_release_content, examples.read_release_content, ("*",), 0.3, lines=True
+    ),
+    Reader("table in Parquet", examples.make_parquet, examples.read_parquet_table, ("*/*",), 0.02, extra="pyarrow"),
     Reader("OSF", _osf, _read_recording, ("r.osf",), 0.2, extra="ouster"),
     Reader("PCAP and metadata", _pcap, _read_recording, ("r.pcap", "r.json"), 0.15, extra="ouster"),
 )

@@ -11,7 +11,9 @@ from tests.trust.readers import READERS
 
 N_INPUTS, SEED = 2000, 24
 # These take 0.3 s an input: `make fuzz` reads more, and pages, which take 3 s.
-SLOW = ("OSF", "PCAP and metadata", "PCD scans", "LAZ scans", "E57", "ROS 1 bag", "ROS 2 bag", "MCAP")
+SLOW = (
+    "OSF", "PCAP and metadata", "PCD scans", "LAZ scans", "E57", "ROS 1 bag", "ROS 2 bag", "MCAP", "table in Parquet",
+)  # fmt: skip
 N_SLOW = 2
 NAMES = [reader.name for reader in READERS if reader.name != "page of a run"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from cdpipe.core.errors import InputError
 from cdpipe.core.geometry.arrays import Float32Array, Float64Array, Int64Array
 
 _BITS = 21
@@ -13,6 +14,25 @@ _HALF = 1 << (_BITS - 1)
 def max_coordinate_m(cell_m: float) -> float:
     """Return the largest coordinate for which `cell_keys` can number cells of this size, metres."""
     return (_HALF - 1) * cell_m
+
+
+def require_reachable(where: str, farthest_m: float, cell_m: float, setting: str = "") -> None:
+    """Refuse places that `cell_keys` cannot number.
+
+    Args:
+        where: The recording, for the message.
+        farthest_m: Its largest coordinate, metres.
+        cell_m: Edge of a cell, metres.
+        setting: The setting that says so, "map.voxel_m = ".
+
+    Raises:
+        InputError: They are too far away, or not finite.
+    """
+    if not farthest_m < max_coordinate_m(cell_m):
+        raise InputError(
+            f"{where}: positions reach {farthest_m:.0f} m, cells of {setting}{cell_m} m can be numbered up to "
+            f"{max_coordinate_m(cell_m):.0f} m: subtract a common offset from the trajectory"
+        )
 
 
 def cell_keys(points: Float64Array, cell_m: float, origin_m: float = 0.0) -> Int64Array:

@@ -20,6 +20,8 @@ from cdpipe.io.foreign.clouds import Cloud
 from cdpipe.io.foreign.trajectory import Trajectory
 
 _THIN_M, _COLUMN_M = 0.2, 0.5
+# Cells of the level grid, 17 bytes each: 2 km by 2 km, and more for a map with more points.
+_MOST_CELLS, _CELLS_A_POINT = 16_000_000, 8
 # A thinned point with no more others than this within that distance is no surface.
 _STRAY_M, _LEAST_AROUND = 0.6, 6
 # Free height that a sensor needs, and its height in it.
@@ -48,11 +50,16 @@ class MapStations:
         """Find the stations of a map.
 
         Raises:
-            InputError: The map has no point, or no floor with room for a sensor.
+            InputError: The map has no point, or no floor with room for a sensor, or is too large.
         """
         self.name = str(path)
         points = cloud.points[np.isfinite(cloud.points).all(axis=1)]
-        stations = find_stations(points)
+        try:
+            stations = find_stations(points)
+        except ValueError as error:
+            raise InputError(
+                f"{path}: one cloud, a map without its scans, and {error}: are lengths metres? Else cut far points away"
+            ) from error
         if len(stations) == 0:
             raise InputError(
                 f"{path}: one cloud, a map without its scans, and no floor with {_FREE_M} m of free height in it: z is "
@@ -90,11 +97,15 @@ def find_stations(points: Float64Array) -> Float64Array:
 
     Args:
         points: (N, 3) points of the map, z up, metres.
+
+    Raises:
+        ValueError: A point lies farther away than cells can be numbered, or floors lie so far apart that a grid over
+            all of them would be larger than a map of so many points.
     """
     if len(points) == 0:
         return np.zeros((0, 3))
     places = _free_places(_without_strays(cell_means(points, _THIN_M)[0]))
-    clear_m = _clear(places)
+    clear_m = _clear(places, _MOST_CELLS + _CELLS_A_POINT * len(points))
     chosen: list[int] = []
     tree = cKDTree(places) if len(places) else None
     is_open = clear_m >= _CLEAR_M
@@ -138,13 +149,21 @@ def _free_places(points: Float64Array) -> Float64Array:
     return np.column_stack([(cells[is_floor] + 0.5) * _COLUMN_M, z_m[is_floor] + above_m])
 
 
-def _clear(places: Float64Array) -> Float64Array:
-    """Return the (P,) level distance of each place from columns that are not free, metres."""
+def _clear(places: Float64Array, most_cells: int) -> Float64Array:
+    """Return the (P,) level distance of each place from columns that are not free, metres.
+
+    Raises:
+        ValueError: The grid over all places has more than `most_cells` cells.
+    """
     if len(places) == 0:
         return np.zeros(0)
     cells: Int64Array = np.floor(places[:, :2] / _COLUMN_M).astype(np.int64)
     cells -= cells.min(axis=0) - 1
-    is_free: BoolArray = np.zeros(cells.max(axis=0) + 2, dtype=np.bool_)
+    shape = [int(n) for n in cells.max(axis=0) + 2]
+    if shape[0] * shape[1] > most_cells:
+        extent = " x ".join(f"{n * _COLUMN_M:.0f}" for n in shape)
+        raise ValueError(f"its floors reach over {extent} m, more than {most_cells * _COLUMN_M**2:.0f} square metres")
+    is_free: BoolArray = np.zeros(shape, dtype=np.bool_)
     is_free[tuple(cells.T)] = True
     return np.asarray(distance_transform_edt(is_free)[tuple(cells.T)] * _COLUMN_M, dtype=np.float64)
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.geometry import BoolArray, Float64Array, transform
-from cdpipe.core.geometry.voxel import UniqueCells, cell_keys
+from cdpipe.core.geometry.voxel import UniqueCells, cell_keys, require_reachable
 from cdpipe.core.progress import Progress
 from cdpipe.io.out.scans import Outgoing, OutScan
 
@@ -36,6 +36,8 @@ def gather_map(outgoing: Outgoing, cell_m: float, report: Progress) -> PointMap:
     scalars: defaultdict[str, list[npt.NDArray[Any]]] = defaultdict(list)
     for scan in outgoing.scans(report):
         points_odom = transform(scan.odom_T_sensor, scan.points)
+        farthest_m = float(np.abs(points_odom).max(initial=0.0))
+        require_reachable(f"{outgoing.name}: scan {scan.index}", farthest_m, cell_m)
         is_first = _find_first(scan, points_odom, cells, cell_m)
         points.append(points_odom[is_first])
         for name, values in _values(scan).items():

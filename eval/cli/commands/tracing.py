@@ -34,8 +34,7 @@ def trace(
     from scenarios.schema import MeshFile
     from sim.trace import draft_scenario, format_scenario, save_picture, trace_mesh
 
-    picture = picture or out.with_suffix(".png")
-    _refuse_names(mesh, out, picture)
+    picture = _refuse_names(mesh, out, picture)
     file = MeshFile(path=str(mesh), units=units or "m", up=up or ("y" if mesh.suffix.lower() == ".glb" else "z"))
     with made_parents(out), made_parents(picture), shown_progress(quiet) as progress:
         found = trace_mesh(
@@ -61,17 +60,19 @@ def trace(
     )
 
 
-def _refuse_names(mesh: Path, out: Path, picture: Path) -> None:
-    """Refuse names of outputs before the work begins.
+def _refuse_names(mesh: Path, out: Path, picture: Path | None) -> Path:
+    """Refuse names before the work begins; return the name of the picture.
 
     Raises:
-        InputError: A name has another suffix than it must have, or stands for something that exists.
+        InputError: A name has another suffix than it must have, stands for something that exists, or is not UTF-8 and
+            so cannot stand in a scenario.
     """
     from cdpipe.core.errors import InputError
     from scenarios.library import SUFFIXES
 
     if out.suffix not in SUFFIXES:
         raise InputError(f"--out {out}: a scenario is a .yaml file: name a new one")
+    picture = picture or out.with_suffix(".png")
     if picture.suffix.lower() != ".png":
         raise InputError(f"--picture {picture}: the picture is a PNG: name a new .png file")
     if mesh.is_dir():
@@ -79,3 +80,8 @@ def _refuse_names(mesh: Path, out: Path, picture: Path) -> None:
     for option, path in (("--out", out), ("--picture", picture)):
         if path.exists() or path.is_symlink():
             raise InputError(f"{option} {path}: exists: name a new file, or remove this one")
+    try:
+        str(mesh).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"{mesh}: its name is not UTF-8, and no scenario could hold it: rename the file") from error
+    return picture

@@ -10,7 +10,7 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, transform, travelled_m
-from cdpipe.core.geometry.voxel import thin
+from cdpipe.core.geometry.voxel import require_reachable, thin
 from cdpipe.core.progress import Progress
 from cdpipe.io.answer import Answer, read_answer
 from cdpipe.io.out.answer_map import require_own_keyframes
@@ -139,6 +139,7 @@ def _thin_session(source: ScanSource, stage: str, on_stage: Progress) -> tuple[F
     """Return at most `MAX_POINTS` points of scans along the path, one per cell, odom frame, and the edge of a cell."""
     poses = source.odom_T_sensor
     scans = choose_keyframes(poses, max(float(travelled_m(poses)[-1]) / _SCANS, 1e-3))
+    require_reachable(source.name, float(np.abs(poses[:, :3, 3]).max(initial=0.0)) + _REACH_M, _CELL_M)
     cell_m, points = _CELL_M, np.zeros((0, 3))
     for done, index in enumerate(scans.tolist()):
         on_stage(stage, done, len(scans))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -109,7 +110,7 @@ def _read_report(folder: Path, own: Path, questions: Mapping[str, str]) -> Repor
 
 
 def _address(folder: Path, path: Path) -> str:
-    return quote(path.relative_to(folder).as_posix())
+    return quote(os.fsencode(path.relative_to(folder).as_posix()))
 
 
 def _read_answer(page: Path) -> str:

@@ -8,9 +8,9 @@ every picture is decoded once: whatever else an earlier page holds does not reac
 from __future__ import annotations
 
 import base64
-import binascii
 import io
 import re
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from html.parser import HTMLParser
@@ -62,7 +62,10 @@ def read_kept(page: Path) -> KeptPage:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{page}: cannot be read, so nothing of it can be kept: {error}") from error
     reader = _Reader()
-    reader.feed(content)
+    try:
+        reader.feed(content)
+    except AssertionError as error:  # of html.parser, where a declaration is malformed
+        raise InputError(f"{page}: no page of `tunnelcd report` ({error!s:.200}): leave out --keep") from error
     return reader.found
 
 
@@ -143,7 +146,7 @@ class _Reader(HTMLParser):
         super().__init__()
         self.found = KeptPage()
         self._section, self._heading, self._address = "", "", ""
-        self._texts: dict[str, str] = {}
+        self._texts: dict[str, list[str]] = {}  # in pieces: a text may come in very many
         self._part = ""
         self._group = ""
         self._rows: list[tuple[str, tuple[Cell, ...]]] = []
@@ -159,15 +162,15 @@ class _Reader(HTMLParser):
             self._section, self._heading = named["id"], ""
         if tag in ("h2", "h3", "caption", "figcaption", "li") or (tag == "p" and "title" in classes):
             self._part = "title" if tag == "p" else tag
-            self._texts[self._part] = ""
+            self._texts[self._part] = []
         elif tag == "table":
             self._group, self._rows, self._headings = "", [], ()
-            self._texts["caption"] = ""
+            self._texts["caption"] = []
         elif tag == "tr":
             self._cells = []
         elif tag in ("td", "th"):
             self._opened = tag, "best" in classes, "group" in classes
-            self._part, self._texts["cell"], self._texts["interval"] = "cell", "", ""
+            self._part, self._texts["cell"], self._texts["interval"] = "cell", [], []
         elif tag == "small" or "interval" in classes:
             self._part = "interval"
         elif tag == "img":
@@ -175,7 +178,10 @@ class _Reader(HTMLParser):
 
     def handle_data(self, data: str) -> None:
         if self._part:
-            self._texts[self._part] += data
+            self._texts.setdefault(self._part, []).append(data)
+
+    def _text(self, part: str) -> str:
+        return "".join(self._texts.get(part, ()))
 
     def handle_endtag(self, tag: str) -> None:
         handlers = {"td": self._end_cell, "th": self._end_cell, "tr": self._end_row, "table": self._end_table,
@@ -183,17 +189,17 @@ class _Reader(HTMLParser):
         if tag in handlers:
             handlers[tag]()
         elif tag == "h2":
-            self.found.titles[self._section] = self._texts.get("h2", "").strip()
+            self.found.titles[self._section] = self._text("h2").strip()
         elif tag == "h3":
-            self._heading = self._texts.get("h3", "").strip()
+            self._heading = self._text("h3").strip()
         elif tag == "li" and self._section == "missing":
-            self.found.missing.append(self._texts.get("li", "").strip())
+            self.found.missing.append(self._text("li").strip())
         if tag not in ("small", "span", "a", "code"):
             self._part = ""
 
     def _end_cell(self) -> None:
         kind, is_best, is_group = self._opened
-        self._cells.append((kind, is_group, Cell(self._texts["cell"], is_best, self._texts["interval"])))
+        self._cells.append((kind, is_group, Cell(self._text("cell"), is_best, self._text("interval"))))
 
     def _end_row(self) -> None:
         cells = [cell for _, _, cell in self._cells]
@@ -205,13 +211,13 @@ class _Reader(HTMLParser):
             self._rows.append((self._group, tuple(cells)))
 
     def _end_table(self) -> None:
-        caption = self._texts["caption"]
+        caption = self._text("caption")
         self.found.tables.setdefault((self._section, caption), Table(self._headings, tuple(self._rows), caption))
 
     def _end_figure(self) -> None:
         address, self._address = self._address, ""
         if is_picture(address):
-            picture = Picture(self._texts.get("title", ""), address, self._texts.get("figcaption", ""))
+            picture = Picture(self._text("title"), address, self._text("figcaption"))
             self.found.pictures.setdefault(self._section, []).append((self._heading, picture))
 
 
@@ -221,10 +227,12 @@ def is_picture(address: str) -> bool:
     if match is None:
         return False
     try:
-        image = Image.open(io.BytesIO(base64.b64decode(match[2], validate=True)), formats=[match[1].upper()])
-        if image.width * image.height > _MOST_PIXELS:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is looked at here
+            image = Image.open(io.BytesIO(base64.b64decode(match[2], validate=True)), formats=[match[1].upper()])
+        if not 0 < image.width * image.height <= _MOST_PIXELS:
             return False
         image.load()
-    except (OSError, SyntaxError, ValueError, binascii.Error):
+    except Exception:  # PIL lets through whatever a damaged picture provokes
         return False
     return True

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+
+from cdpipe.core.errors import InputError
+from cdpipe.core.files import read_json
 
 # Values that are held in dicts, a hundred bytes each. A table with no more is made at once.
 CHUNK_VALUES = 1_000_000
@@ -94,7 +96,7 @@ def _read_place(path: Path) -> tuple[int, int]:
     if found := _ORDER.search(head):
         return int(found[1]), int(found[2])
     try:
-        first, second = json.loads(path.read_bytes())["order"]
+        first, second = read_json(path, "")["order"]
         return int(first), int(second)
-    except (ValueError, TypeError, KeyError):
+    except (InputError, ValueError, TypeError, KeyError, OverflowError):
         return 0, 0  # what is no cell has no rows

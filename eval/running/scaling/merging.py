@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_json, read_npz
-from eval.core.output import new_folder
+from eval.core.output import copy_folder, new_folder
 from eval.core.progress import RunProgress, Silent
 from eval.core.provenance import digest, now
 from eval.plans.cells import list_planned_cases
@@ -218,7 +218,7 @@ def _take_pairs(runs: Sequence[RunFolder], target: Path, progress: RunProgress) 
         progress.stage("sessions", done, len(found))
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir():
-            shutil.copytree(path, target / name, copy_function=_link_or_copy)
+            copy_folder(path, target / name, _link_or_copy)
         else:
             _link_or_copy(path, target / name)
 

@@ -92,3 +92,15 @@ def test_a_merge_that_is_not_known_is_refused(tmp_path: Path) -> None:
 def test_a_map_without_a_floor_is_refused(tmp_path: Path, points: Float64Array) -> None:
     with pytest.raises(InputError, match=r"no floor with 1\.2 m of free height"):
         open_session(write(tmp_path / "map.ply", points))
+
+
+def test_a_map_of_another_unit_or_with_lost_points_is_refused_on_one_line(tmp_path: Path) -> None:
+    near, apart = drift(1)[:20_000], np.array([60_000.0, 60_000.0, 0.0])
+    for name, points, told in (
+        ("far.ply", np.concatenate([near, [[1e7, 0.0, 0.0]]]), "points must be finite and within 209715 m"),
+        # two floors far apart: a grid over both would fill the memory
+        ("wide.ply", np.concatenate([near, near + apart]), "its floors reach over 60"),
+    ):
+        with pytest.raises(InputError, match=told) as caught:
+            open_session(write(tmp_path / name, points))
+        assert name in str(caught.value) and "\n" not in str(caught.value)

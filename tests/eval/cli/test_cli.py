@@ -473,7 +473,7 @@ def test_an_interrupt_says_that_cells_are_kept(
         assert (code, "finished cells are kept" in err) == (130, True)
 
 
-def test_an_interrupt_elsewhere_says_that_nothing_was_written(
+def test_an_interrupt_elsewhere_leaves_nothing_half_written(
     tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: object, **__: object) -> None:
@@ -481,7 +481,7 @@ def test_an_interrupt_elsewhere_says_that_nothing_was_written(
 
     monkeypatch.setattr(making, "simulate_pair", interrupted)
     assert command("simulate", "smoke/one_box", "--out", tmp_path / "out", "--quiet") == (
-        130, "", "interrupted; nothing was written\n",
+        130, "", "interrupted; nothing half-written is left\n",
     )  # fmt: skip
     assert tree(tmp_path) == set()
 

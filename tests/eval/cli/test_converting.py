@@ -179,7 +179,7 @@ def test_an_interrupt_leaves_nothing(
         source, target = tmp_path.parent / "whole.osf", tmp_path / "new" / "a"
         converting.convert([pair / "before"], source, quiet=True)
         monkeypatch.setattr(SessionWriter, "add", interrupted)
-    assert command("convert", source, target, "--quiet") == (130, "", "interrupted; nothing was written\n")
+    assert command("convert", source, target, "--quiet") == (130, "", "interrupted; nothing half-written is left\n")
     source.with_name("whole.osf").unlink(missing_ok=True)
     assert list(tmp_path.iterdir()) == []
 

@@ -21,6 +21,15 @@ def test_the_disk_is_named_in_one_line(number: int, capsys: pytest.CaptureFixtur
     assert capsys.readouterr().err.startswith(f"error: the output: {os.strerror(number)}: ")
 
 
+def test_a_name_that_no_file_can_have_is_told_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    for number in (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR):
+        with pytest.raises(SystemExit) as caught, input_errors():
+            raise OSError(number, os.strerror(number), "a/b")
+        assert caught.value.code == 2
+        told = capsys.readouterr().err
+        assert told.startswith(f"error: a/b: {os.strerror(number)}: ") and told.count("\n") == 1
+
+
 def test_any_other_error_of_the_system_is_a_bug() -> None:
     with pytest.raises(ConnectionResetError), input_errors():
         raise ConnectionResetError(errno.ECONNRESET, "reset")

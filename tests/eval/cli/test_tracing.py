@@ -58,6 +58,10 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest
         ((mesh, "--out", tmp_path / "mine.txt"), "a scenario is a .yaml file"),
         ((mesh, "--out", out, "--picture", tmp_path / "a.jpg"), "name a new .png file"),
         ((tmp_path, "--out", out), "is a folder"),
+        ((mesh, "--out", "."), "a scenario is a .yaml file"),
+        ((mesh, "--out", ""), "a scenario is a .yaml file"),
+        ((mesh, "--out", tmp_path / f"{'x' * 300}.yaml"), "File name too long"),
+        ((tmp_path / "\udcff.stl", "--out", out), "is not UTF-8"),
         ((tmp_path / "none.stl", "--out", out), "no such file"),
     ):
         code, printed, err = run(capsys, "trace", *argv, "--quiet")

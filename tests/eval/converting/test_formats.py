@@ -15,7 +15,7 @@ import yaml
 from cdpipe.core.geometry import Float64Array, invert, transform
 from cdpipe.io.answer import write_answer
 from cdpipe.io.foreign import read_poses
-from cdpipe.io.ply import read_ply
+from cdpipe.io.ply import read_ply, write_ply_points
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import Session, read_session
 from cdpipe.mapping.mapping import choose_keyframes
@@ -24,6 +24,7 @@ from eval.converting.truth import truth_fields
 from scenarios import load_scenario
 from sim.rock.glb import count_glb
 from sim.session.truth import read_pair_truth, read_true_poses
+from tests.cdpipe.io.foreign_files import drive, write_trajectory
 
 Result = tuple[int, str, str]
 Command = Callable[..., Result]
@@ -317,6 +318,21 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     for name in ("a.mcap", "a.bag", "a.laz", "a.tum", "a.pcap"):
         assert command("convert", before, tmp_path / "new" / name, "--quiet")[0] == 130
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("far", ["trajectory", "point"])
+def test_a_recording_too_far_away_for_a_map_is_one_line(tmp_path: Path, command: Command, far: str) -> None:
+    made = drive(3, 200, 0.0)
+    (tmp_path / "r").mkdir()
+    for index, (points, _) in enumerate(made.clouds):
+        lost = np.array([[1e7, 0.0, 0.0]] if far == "point" else np.zeros((0, 3)))
+        write_ply_points(tmp_path / "r" / f"{index:06d}.ply", np.concatenate([points, lost]))
+    rows = [line.split() for line in write_trajectory(tmp_path / "t", made.stamps_s).read_text().splitlines()]
+    shift = 5e6 if far == "trajectory" else 0.0
+    text = "".join(f"{row[0]} {float(row[1]) + shift} {' '.join(row[2:])}\n" for row in rows)
+    (tmp_path / "r" / "trajectory.txt").write_text(text)
+    refused(command("convert", tmp_path / "r", tmp_path / "a.ply"), "subtract a common offset from the trajectory")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["r", "t"]
 
 
 def test_a_full_disk_is_one_line_and_leaves_nothing(pair: Path, tmp_path: Path, command: Command) -> None:

@@ -1,9 +1,15 @@
+import errno
+import os
+import shutil
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from cdpipe.core.errors import InputError
-from eval.core.output import make_writable, new_folder
+from eval.core.output import copy_folder, make_writable, new_files, new_folder, whole_file
 
 
 def tree(folder: Path) -> list[str]:
@@ -67,3 +73,70 @@ def test_where_nobody_may_write(tmp_path: Path) -> None:
         pytest.skip("needs /proc")
     with pytest.raises(InputError, match="name a folder you may write to"), new_folder(Path("/proc/self/out")):
         pass
+
+
+LONGEST = 255  # bytes of a name that file systems take
+
+
+@pytest.mark.parametrize("name", ["x" * LONGEST, "ü" * (LONGEST // 2)])
+def test_every_name_that_the_file_system_takes_can_be_written(tmp_path: Path, name: str) -> None:
+    with new_folder(tmp_path / "a" / name) as partial:
+        (partial / "file").write_text("x")
+    with whole_file(tmp_path / "b" / name) as partial:
+        partial.write_text("x")
+    with new_files(tmp_path / "c" / name) as partial:
+        (partial / name).write_text("x")
+    assert tree(tmp_path) == ["a", f"a/{name}", f"a/{name}/file", "b", f"b/{name}", "c", f"c/{name}"]
+
+
+@pytest.mark.parametrize("name", ["x" * 300, f"{'x' * 300}/y", f"y/{'x' * 300}"])
+def test_longer_names_are_refused_on_one_line(tmp_path: Path, name: str) -> None:
+    for write in (new_folder, new_files):
+        with pytest.raises(InputError, match="File name too long"), write(tmp_path / name):
+            pass
+    assert tree(tmp_path) == []
+
+
+def test_a_folder_is_no_name_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(IsADirectoryError), whole_file(Path()) as partial:
+        partial.write_text("x")
+    assert tree(tmp_path) == [] and not list(tmp_path.parent.glob(".*.partial"))
+
+
+def test_a_folder_is_copied_until_a_file_cannot_be(tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        (tmp_path / "old" / "deep").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "old" / "deep" / name).write_text(name)
+    tried: list[str] = []
+
+    def copy(source: str, target: str) -> None:
+        tried.append(target)
+        if len(tried) > 1:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), target)
+        shutil.copyfile(source, target)
+
+    # shutil.copytree goes on with the other files, and its error has no number
+    with pytest.raises(OSError, match="No space left") as caught:
+        copy_folder(tmp_path / "old", tmp_path / "new", copy)
+    assert caught.value.errno == errno.ENOSPC and len(tried) == 2
+    shutil.rmtree(tmp_path / "new")
+    copy_folder(tmp_path / "old", tmp_path / "new")
+    assert tree(tmp_path / "new") == tree(tmp_path / "old")
+
+
+@pytest.mark.parametrize("write", [new_folder, new_files])
+def test_nothing_is_left_when_the_start_is_interrupted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Callable[[Path], AbstractContextManager[Path]]
+) -> None:
+    make = Path.mkdir
+
+    def make_and_interrupt(path: Path, *args: Any, **options: Any) -> None:
+        make(path, *args, **options)
+        if path.name.endswith(".partial"):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "mkdir", make_and_interrupt)
+    with pytest.raises(KeyboardInterrupt), write(tmp_path / "a" / "b"):
+        pass
+    assert tree(tmp_path) == []

@@ -273,3 +273,55 @@ def test_reference_rows_are_of_the_same_pairs(packed: Path, tmp_path: Path) -> N
     page = (tmp_path / "board.html").read_text()
     assert page.count('class="reference"') == 1 and "ours" in page and "elsewhere" not in page
     assert page.index('class="reference"') < page.index('class="entry"')  # the best IoU stands first
+
+
+def test_only_earlier_results_are_replaced_by_results(evaluated: RunFolder, packed: Path, tmp_path: Path) -> None:
+    before = packed.read_bytes()
+    assert pack_submission(evaluated, "mine", packed) == 2 and packed.read_bytes() == before
+    for name, content in (("other.zip", b"PK\x03\x04 of somebody else"), ("empty.zip", b"")):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match="exists, and is no file of `tunnelcd submit`"):
+            pack_submission(evaluated, "mine", tmp_path / name)
+        assert (tmp_path / name).read_bytes() == content
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.zip", "mine.zip", "other.zip"]
+
+
+def test_only_an_earlier_page_is_replaced_by_a_page(packed: Path, tmp_path: Path) -> None:
+    found, page = read_submission(packed), tmp_path / "board.html"
+    for _ in range(2):
+        write_leaderboard([found], page, None, [0])
+    (tmp_path / "mine.html").write_text("<title>my notes</title>")
+    with pytest.raises(InputError, match="exists, and is no page of `tunnelcd leaderboard`"):
+        write_leaderboard([found], tmp_path / "mine.html", None, [0])
+    assert (tmp_path / "mine.html").read_text() == "<title>my notes</title>"
+
+
+@pytest.mark.parametrize("place", ["file/x", "circle/x", "a" * 300, "dir/" + "a" * 300, "/proc/x"])
+def test_places_that_cannot_be_written_are_one_line(
+    evaluated: RunFolder, packed: Path, tmp_path: Path, command: Callable[..., tuple[int, str, str]], place: str
+) -> None:
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "circle").symlink_to("circle")
+    before = sorted(tmp_path.iterdir())
+    for argv, suffix in ((("submit", evaluated.path), ".zip"), (("leaderboard", packed), ".html")):
+        code, out, err = command(*argv, "--out", tmp_path / f"{place}{suffix}", "--quiet")
+        assert (code, out) == (2, "") and err.startswith("error: ") and err.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(("key", "value"), [("seconds", 1e300), ("pair_digest", "x" * 1000)])
+def test_calls_that_cannot_be_are_one_line(run: RunFolder, tmp_path: Path, key: str, value: object) -> None:
+    (call,) = run.path.glob("evaluations/mine/smoke__unchanged/20000.json")
+    call.write_text(json.dumps({**json.loads(call.read_text()), key: value}))
+    with pytest.raises(InputError, match="smoke/unchanged 20000") as caught:
+        pack_submission(run, "mine", tmp_path / "x.zip")
+    assert "\n" not in str(caught.value) and not (tmp_path / "x.zip").exists()
+
+
+def test_an_evaluation_that_cannot_be_is_one_line(run: RunFolder, tmp_path: Path) -> None:
+    path = run.path / "evaluations" / "mine" / "evaluation.json"
+    document = json.loads(path.read_text())
+    path.write_text(json.dumps({**document, "split": "x" * 1000}))
+    with pytest.raises(InputError, match="split") as caught:
+        pack_submission(run, "mine", tmp_path / "x.zip")
+    assert "\n" not in str(caught.value) and not (tmp_path / "x.zip").exists()

@@ -1,6 +1,7 @@
 """Releases of pairs: made in parts, packed, described, unpacked and scored; damage is one line."""
 
 import csv
+import hashlib
 import json
 import shutil
 import subprocess
@@ -145,7 +146,7 @@ def test_a_pair_that_was_interrupted_is_made_again(
     release = load_release(str(tiny))
     lost, kept = release.pairs
     shutil.rmtree(tmp_path / "raw" / "sessions" / lost.name)
-    (tmp_path / "raw" / ".making-left").mkdir()
+    (tmp_path / "raw" / ".making-0a1b2c_d").mkdir()  # as a killed run leaves it
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
@@ -208,8 +209,27 @@ def test_a_file_or_folder_of_others_is_not_touched(made: Path, tmp_path: Path, t
     with pytest.raises(InputError, match=r"holds thesis\.tex, which is not of this release"):
         make_release(release, tmp_path / "own")
     assert list_files(tmp_path / "own") == ["thesis.tex"]
+    for name in (".making-of", ".making-of-it"):
+        (tmp_path / "film").mkdir(exist_ok=True)
+        (tmp_path / "film" / name).mkdir()
+        (tmp_path / "film" / name / "cut.txt").write_text("x")
+        with pytest.raises(InputError, match=r"holds \.making-of"):
+            make_release(release, tmp_path / "film")
+    assert list_files(tmp_path / "film") == [".making-of-it/cut.txt", ".making-of/cut.txt"]
     with pytest.raises(InputError, match="--scheduler: a release is made on this machine"):
         make_release(release, tmp_path / "x", Where(scheduler="tcp://127.0.0.1:1"))
+
+
+def test_links_do_not_lead_out_of_a_release(tmp_path: Path, tiny: Path) -> None:
+    release, others = load_release(str(tiny)), tmp_path / "others"
+    (others / "deep").mkdir(parents=True)
+    for link, out in (("r.zip.parts", "r.zip"), ("folder/sessions", "folder"), ("folder/.making-0a1b2c_d", "folder")):
+        (tmp_path / "folder").mkdir(exist_ok=True)
+        (tmp_path / link).symlink_to(others)
+        with pytest.raises(InputError, match="is a link"):
+            make_release(release, tmp_path / out)
+        (tmp_path / link).unlink()
+    assert [path.name for path in others.rglob("*")] == ["deep"]
 
 
 def test_damage_is_one_line_and_nothing_is_left(made: Path, tmp_path: Path, command: Command) -> None:
@@ -231,10 +251,22 @@ def test_damage_is_one_line_and_nothing_is_left(made: Path, tmp_path: Path, comm
     def forget(members: dict[str, bytes]) -> None:
         del members["truth/pairs.csv"]
 
+    def add(*names: str) -> Callable[[dict[str, bytes]], None]:
+        def change(members: dict[str, bytes]) -> None:
+            members |= dict.fromkeys(names, b"x")
+            digest = hashlib.sha256(b"x").hexdigest()
+            members["SHA256SUMS"] += "".join(f"{digest}  {name}\n" for name in names).encode()
+
+        return change
+
+    pair = f"sessions/{'0' * 16}"
     bad = tmp_path / "bad.zip"
     for change, said in (
         (forge, "its digest differs"), (escape, "not in both"), (escape_with_digest, "name of a file"),
         (forget, "not in both"), (lambda members: members.pop("SHA256SUMS"), "no SHA256SUMS in it"),
+        (add(f"{pair}/{'a' * 300}"), "longer than a file's name"),
+        (add(f"{pair}/{'a/' * 3000}a"), "longer than a file's name"),
+        (add(f"{pair}/a", f"{pair}/a/b"), "a file and a folder"), (add(f"{pair}/a", f"{pair}/A"), "stands twice"),
     ):  # fmt: skip
         rewrite(made, bad, change)
         code, out, err = command("dataset", "--unpack", bad, "--out", tmp_path / "out", "--quiet")

@@ -20,6 +20,7 @@ from sim.graft.noise import EDGES_M, RangeNoise, find_bins
 from sim.graft.part import Part, RecordedRevolution
 from sim.graft.plan import plan_graft
 from sim.graft.rebuild import rebuild_props
+from sim.graft.surroundings import Surroundings
 from sim.placement.contact import standing_surface
 from sim.session.truth import SESSIONS, read_chunk_labels, read_pair_truth, read_true_poses
 from sim.view.view import view_pair
@@ -324,3 +325,11 @@ def test_a_pair_of_one_revolution_is_refused(recording: Session) -> None:
     alone = replace(recording, odom_T_sensor=recording.odom_T_sensor[:1])
     with pytest.raises(InputError, match="one revolution makes no pair"):
         plan_graft(make_graft(), SEED, Recorded((alone,)), quiet)
+
+
+def test_a_recording_in_map_coordinates_is_refused(recording: Session) -> None:
+    poses = recording.odom_T_sensor.copy()
+    poses[:, 0, 3] += 5e6
+    far = Part("before", replace(recording, odom_T_sensor=poses), np.arange(4), np.eye(4))
+    with pytest.raises(InputError, match="subtract a common offset from the trajectory"):
+        Surroundings([far], 10.0)

@@ -1,6 +1,7 @@
 """The index of reports leads to all of them, and names of folders and texts of files are text in it."""
 
 import html
+import os
 import re
 import shutil
 from pathlib import Path
@@ -83,3 +84,11 @@ def test_a_folder_without_reports_is_refused_on_one_line(tmp_path: Path, name: s
         write_index(tmp_path / name)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / name / "index.html").exists()
+
+
+def test_a_name_that_is_not_utf_8_is_an_address(tmp_path: Path) -> None:
+    (tmp_path / "one").mkdir()
+    odd = os.fsdecode(b"\xff\xfe.md")
+    (tmp_path / "one" / odd).write_text("# A")
+    found = links(write_index(tmp_path))
+    assert "one/%FF%FE.md" in found and r"\udcff\udcfe.md" in (tmp_path / "index.html").read_text()

@@ -4,6 +4,8 @@ import base64
 import io
 import re
 import shutil
+import struct
+import zlib
 from pathlib import Path
 
 import pytest
@@ -87,3 +89,34 @@ def test_a_page_that_cannot_be_read_is_refused_on_one_line(tmp_path: Path) -> No
         read_kept(page)
     assert "\n" not in str(caught.value)
     assert read_kept(tmp_path / "none.html").tables == {}
+
+
+@pytest.mark.parametrize(
+    "text", ["</td></tr></table>", "</table>", "<tr></tr>", "<td>x", "</figure></li></h2>", "<![foo[ x"]
+)
+def test_a_page_with_tags_out_of_place_is_read_or_refused_on_one_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / "index.html").write_text(text)
+    try:
+        assert all(table.caption == "" for table in read_kept(tmp_path / "index.html").tables.values())
+    except InputError as error:
+        assert "index.html: no page of `tunnelcd report`" in str(error) and "\n" not in str(error)
+
+
+def test_a_text_in_many_pieces_is_one_text(tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text('<h2 id="x">' + "y<i>" * 1000 + "</h2>")
+    assert read_kept(tmp_path / "index.html").titles == {"x": "y" * 1000}
+
+
+def png_of(width: int, height: int) -> str:
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    content = b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+    return f"data:image/png;base64,{base64.b64encode(content).decode()}"
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("size", [(10_000, 10_000), (20_000, 20_000), (2**31 - 1, 2**31 - 1), (0, 5)])
+def test_a_picture_that_says_it_is_huge_is_none(size: tuple[int, int]) -> None:
+    assert not is_picture(png_of(*size))

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cdpipe.core.errors import InputError
 from eval.running.cell_rows import collect_tables
 from eval.running.runfolder import RunFolder, read_json, write_json
 from eval.running.scaling.frames import RowTable, sort_cells
@@ -63,3 +64,16 @@ def test_rows_follow_the_plan_and_not_the_names_of_folders(tmp_path: Path) -> No
     assert read_json(moved)["row"]["scenario"] == "c/x"
     rows = collect_tables(run)["results"]
     assert [("cab".index(row.scenario[0]), row.seed, 1 - int(row.variant[1])) for row in rows.itertuples()] == places
+
+
+@pytest.mark.parametrize(
+    "content", [b"[" * 200_000, b'{"a": 1, "order": [1e999, 1]}', b'{"order": [[], {}]}', b"\xff", b""]
+)
+def test_a_file_that_is_no_cell_has_a_place_and_no_row(tmp_path: Path, content: bytes) -> None:
+    run = RunFolder(tmp_path)
+    path = run.cell("a/x", 1, "v")
+    path.parent.mkdir(parents=True)
+    path.write_bytes(content)
+    assert sort_cells([path], {}) == [path]
+    with pytest.raises(InputError, match="no finished cell"):
+        collect_tables(run)
