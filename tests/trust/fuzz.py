@@ -4,7 +4,7 @@ An input is one damaged file in a reader's example folder; it follows from (seed
 
 - `read` or `one line`: as it should be;
 - `several lines`: an `InputError` of more than one line where one was expected, or of none;
-- `traceback`: any other exception;
+- `traceback`: any other exception, or one that a process of the reader's own prints;
 - `over 10 s`: more than 10 s of CPU time, or a minute without an answer;
 - `over memory`: the process grew by more than 500 MB plus ten times the folder;
 - `death`: the process ended.
@@ -140,12 +140,14 @@ class Watched:
         self._out, self._seed = out, seed
         self._process: subprocess.Popen[bytes] | None = None
         self._answers: SimpleQueue[bytes] = SimpleQueue()
+        self.printed = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `__exit__`; what the process and its own print
 
     def __enter__(self) -> Watched:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._end()
+        self.printed.close()
 
     def read(self, name: str, number: int) -> dict[str, Any]:
         """Read one input, keep it if it is a defect, and return what came of it."""
@@ -164,6 +166,9 @@ class Watched:
                 answer["text"] = f"ended with exit code {code}"
         except Empty:
             answer |= {"outcome": "over 10 s", "seconds": time.monotonic() - asked, "text": "no answer for a minute"}
+        printed = self._take_printed()
+        if answer["outcome"] in OUTCOMES[:3] and "Traceback (most recent call last)" in printed:
+            answer |= {"outcome": "traceback", "text": printed[-4000:]}
         if answer["outcome"] in ("death", "over 10 s") or answer.get("is_grown"):
             self._end()
         if answer["outcome"] in DEFECTS:
@@ -173,7 +178,9 @@ class Watched:
     def _start(self) -> subprocess.Popen[bytes]:
         argv = [sys.executable, "-m", "tests.trust.fuzz", "--serve", str(self._out), "--seed", str(self._seed)]
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-        self._process = subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, cwd=ROOT)
+        self._process = subprocess.Popen(
+            argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self.printed, env=environment, cwd=ROOT
+        )
         self._answers = SimpleQueue()
         threading.Thread(target=_pump, args=(self._process, self._answers), daemon=True).start()
         self._answers.get(timeout=SILENT_S)  # it has loaded the readers
@@ -187,6 +194,14 @@ class Watched:
                 assert pipe is not None
                 pipe.close()
             self._process = None
+
+    def _take_printed(self) -> str:
+        """Return what was printed since the last call."""
+        size = self.printed.seek(0, os.SEEK_END)
+        printed = os.pread(self.printed.fileno(), size, 0).decode(errors="replace")
+        self.printed.seek(0)
+        self.printed.truncate()
+        return printed
 
     def _keep(self, name: str, number: int, answer: dict[str, Any]) -> None:
         folder = self._out / "kept" / f"{answer['outcome'].replace(' ', '_')}-{name.replace(' ', '_')}-{number}"

@@ -58,3 +58,13 @@ def test_damaged_files_are_read_or_refused_on_one_line(folder: Path, tmp_path: P
     # most damage is seen, and some of it does no harm
     assert sum(tally.outcomes["one line"] for tally in tallies.values()) > N_INPUTS / 2
     assert sum(tally.outcomes["read"] for tally in tallies.values()) > N_INPUTS / 10
+
+
+def test_what_a_process_of_a_reader_prints_is_seen(folder: Path, tmp_path: Path) -> None:
+    name = next(name for name in NAMES if name not in SLOW)
+    with Watched(folder, SEED) as watched:
+        assert watched.read(name, 0)["outcome"] in ("read", "one line")
+        watched.printed.write(b"Traceback (most recent call last):\n  a process of the reader's\n")
+        watched.printed.flush()
+        assert watched.read(name, 0)["outcome"] == "traceback"
+        assert watched.read(name, 0)["outcome"] in ("read", "one line")

@@ -84,6 +84,19 @@ def test_damaged_parts_are_one_line(tmp_path: Path) -> None:
     assert read_table(folder).empty
 
 
+def test_metadata_that_the_library_trips_over_are_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    write_rows(tmp_path / "regions.csv", rows())
+    folder = tmp_path / "regions.parquet"
+    part = next(iter(sorted(folder.iterdir())))
+    arrow = pytest.importorskip("pyarrow.parquet")
+    table = arrow.read_table(part)
+    damaged = {b"pandas": b'{"index_columns": [], "column_indexes": [], "columns": [{"numpy_type": "int64"}]}'}
+    arrow.write_table(table.replace_schema_metadata(damaged), part)
+    with pytest.raises(InputError, match="cannot be read as a table: 'name'"):
+        parquet.read_parquet(folder)
+    assert capfd.readouterr().err == ""
+
+
 def test_a_part_that_expands_too_far_is_refused(tmp_path: Path) -> None:
     write_rows(tmp_path / "regions.csv", rows())
     with pytest.raises(InputError, match="expands to more than 50 bytes"):
