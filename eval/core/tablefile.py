@@ -63,12 +63,15 @@ def read_table(path: Path) -> pd.DataFrame:
     try:
         if path.suffix == ".xz":
             content = _decompress(content)
-        return pd.read_csv(io.BytesIO(content), low_memory=False)
+        table = pd.read_csv(io.BytesIO(content), low_memory=False)
     except pd.errors.EmptyDataError:
         return pd.DataFrame()
     except Exception as error:  # the parser of pandas lets through whatever a damaged file provokes
         said = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: cannot be read as a table: {said:.200}") from error
+    if not isinstance(table.index, pd.RangeIndex):  # pandas makes an index of the first cells of such rows
+        raise InputError(f"{path}: cannot be read as a table: rows have more cells than the header")
+    return table
 
 
 def _decompress(content: bytes) -> bytes:

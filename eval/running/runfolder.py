@@ -36,6 +36,7 @@ import pandas as pd
 from cdpipe.core import files
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArraySpec, read_npz
+from cdpipe.core.geometry.voxel import require_reachable
 from cdpipe.core.names import path_part
 from eval.core.output import make_writable, remove, require_no_links, whole_file
 from eval.core.provenance import FORMAT_VERSION, TOOL
@@ -45,6 +46,7 @@ from eval.plans.coverage import measure_coverage, read_stored_plan
 from eval.plans.targets import read_targets
 from eval.plans.worlds import world_slug
 from eval.running.cell_rows import ITEM_TABLES, SURFACE_TABLES, collect_tables, holds_rows
+from eval.running.results.tables import without_unusable
 from eval.tables.effects import effects
 from eval.tables.hardness import FILES as HARD_FILES
 from eval.tables.hardness import breaking_points, hardness_table
@@ -56,6 +58,7 @@ from eval.tables.region_table import region_tables
 from eval.tables.surface_table import FILES as SURFACE_FILES
 from eval.tables.surface_table import surface_tables
 
+_MAP_CELL_M = 0.1  # pictures number no smaller cells
 _MAPS = {"before_points": ArraySpec("N,3", "float32"), "after_points": ArraySpec("M,3", "float32")}
 
 
@@ -88,6 +91,10 @@ class RunFolder:
             InputError: They are missing or damaged.
         """
         maps = read_npz(self.maps(scenario, seed), _MAPS)
+        for name, points in maps.items():
+            require_reachable(
+                f"{self.maps(scenario, seed)}: {name}", float(np.abs(points).max(initial=0.0)), _MAP_CELL_M
+            )
         return maps["before_points"], maps["after_points"]
 
     def stages(self, scenario: str, seed: int) -> Path:
@@ -196,13 +203,13 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     write_rows(run.path / "results.csv", results)
     for table, frame in items.items():
         write_rows(run.path / f"{table}.csv", frame)
-    _write_csv(run.path / "summary.csv", summarise(results, keyframes=items["keyframes"]))
-    surface_items = {table: collected[table] for table in SURFACE_TABLES}
+    usable = {table: without_unusable(frame) for table, frame in collected.items()}
+    _write_csv(run.path / "summary.csv", summarise(usable["results"], keyframes=usable["keyframes"]))
     tables = {
-        **surface_items,
-        "effects": effects(results),
-        "merge": merge_table(results, read_targets(run.stored_provenance())),
-        **_report_tables(run, results, {**items, **surface_items}),
+        **{table: collected[table] for table in SURFACE_TABLES},
+        "effects": effects(usable["results"]),
+        "merge": merge_table(usable["results"], read_targets(run.stored_provenance())),
+        **_report_tables(run, usable["results"], usable),
     }
     for name, frame in tables.items():
         if len(frame):

@@ -1,5 +1,6 @@
 import hashlib
 import json
+import math
 import os
 import shutil
 from collections.abc import Callable, Iterable
@@ -215,6 +216,26 @@ def test_limit_and_then_the_rest(tmp_path: Path, runner: Runner) -> None:
     assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(1, 1, 0)
     assert table(run)["variant"].tolist() == ["voxel-diff", "random-regions"]
     assert runner.families() == [ONE_BOX]
+
+
+def test_an_infinite_figure_of_a_cell_stands_in_results_alone(smoke_copy: RunFolder) -> None:
+    path = next(iter(sorted(smoke_copy.path.glob("cells/*/*/*.json"))))
+    cell = json.loads(path.read_text())
+    cell["row"] |= {"n_partial": math.inf, "n_observable": math.inf}
+    path.write_text(json.dumps(cell))
+    assert np.isinf(write_tables(smoke_copy)["n_partial"]).sum() == 1
+    assert not np.isinf(pd.read_csv(smoke_copy.path / "summary.csv").select_dtypes("number")).any(axis=None)
+
+
+def test_maps_beyond_what_pictures_can_show_are_one_line(smoke_copy: RunFolder) -> None:
+    path = next(iter(sorted(smoke_copy.path.glob("maps/*/*.npz"))))
+    with np.load(path) as stored:
+        points = {name: stored[name].copy() for name in stored.files}
+    points["after_points"][0, 1] = 1e30
+    np.savez(path, allow_pickle=False, **points)
+    scenario, seed = path.parent.name.replace("__", "/"), int(path.stem)
+    with pytest.raises(InputError, match=rf"{path.name}: after_points: positions reach 1.*can be numbered up to"):
+        smoke_copy.read_maps(scenario, seed)
 
 
 def test_a_changed_setting_redoes_its_cells_only(tmp_path: Path, runner: Runner) -> None:
