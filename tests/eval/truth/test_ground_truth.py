@@ -1,15 +1,30 @@
 """The truth of a pair put together: which changes count, where they lie, and sessions that do not fit."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import make_pose
-from eval.truth.ground_truth import SessionTruth, ground_truth
+from eval.truth.ground_truth import (
+    SessionTruth,
+    SurfaceLabels,
+    _load_seen_movers,
+    _load_surface,
+    ground_truth,
+    load_ground_truth,
+)
 from eval.truth.scoring_points import ScoringPoints
-from sim.session.truth import PairTruth
+from sim.session.truth import MoverTrack, PairTruth, write_mover_track, write_surface_labels
 from tests.eval.changes import change
+from tests.eval.conftest import CHUNK_SCANS
+
+RETURNS = np.array([0, 7, 13, 17, 24, 29])
 
 
 def session(labels: list[int]) -> SessionTruth:
@@ -61,3 +76,52 @@ def test_poses_that_do_not_fit_are_named(name: str, change_it: object, told: str
     right = session([0])
     with pytest.raises(ValueError, match=told):
         replace(right, **{name: change_it(getattr(right, name))})
+
+
+def load_surface_labels(folder: Path, n_scans: Sequence[int]) -> SurfaceLabels | None:
+    """Write the labels of five scans of 2 x 3 pixels in chunks of two, and load those of six returns.
+
+    The k-th return of the session moved by k mm and belongs to change k mod 5.
+    """
+    for index, n in enumerate(n_scans):
+        number = 12 * index + np.arange(6 * n).reshape(n, 2, 3)
+        write_surface_labels(folder, index, (number / 1000).astype(np.float32), (number % 5).astype(np.int16))
+    session: Any = SimpleNamespace(path=folder, n_chunks=3, chunk_scans=2, n_scans=5)
+    of_points = np.zeros(6, dtype=np.int16)
+    return _load_surface(session, ScoringPoints(RETURNS, np.zeros((6, 3), np.float32), of_points, of_points, 5, 6))
+
+
+def test_every_scoring_point_has_the_movement_of_its_return(tmp_path: Path) -> None:
+    assert load_surface_labels(tmp_path / "without", []) is None
+    labels = load_surface_labels(tmp_path, (2, 2, 1))
+    assert labels is not None
+    np.testing.assert_array_equal(labels.displacement_m, (RETURNS / 1000).astype(np.float32))
+    np.testing.assert_array_equal(labels.change, RETURNS % 5)
+    assert (labels.displacement_m.dtype, labels.change.dtype) == (np.float32, np.int16)
+
+
+def test_movements_of_a_session_with_other_scans_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"^surface/00002\.npz must be \(1, 6\), got \(2, 6\)"):
+        load_surface_labels(tmp_path, (2, 2, 2))
+
+
+def test_movers_are_seen_where_they_have_returns(tmp_path: Path) -> None:
+    assert _load_seen_movers(tmp_path, 0, 3).shape == (0, 3)
+    seen_world = np.arange(18.0).reshape(2, 3, 3)
+    n_returns = np.array([[0, 1, 2], [3, 0, 0]], dtype=np.int32)
+    write_mover_track(tmp_path, MoverTrack(np.tile(np.eye(4), (2, 3, 1, 1)), n_returns, seen_world))
+    np.testing.assert_array_equal(_load_seen_movers(tmp_path, 2, 3), seen_world[[0, 0, 1], [1, 2, 0]])
+    with pytest.raises(InputError, match="it has 2 movers and 3 revolutions, expected 2 and 4"):
+        _load_seen_movers(tmp_path, 2, 4)
+
+
+def test_movements_come_with_the_truth_of_a_pair(tiny_pair: Path) -> None:
+    truth = load_ground_truth(tiny_pair, keeps_points=False)
+    assert not list(tiny_pair.glob("*/truth/scoring_points.npz"))
+    points = truth.sessions["before"].scoring_points
+    for index, first in enumerate(range(0, points.n_scans, CHUNK_SCANS)):
+        shape = min(CHUNK_SCANS, points.n_scans - first), 1, points.n_pixels
+        write_surface_labels(tiny_pair / "before", index, np.full(shape, 0.25, np.float32), np.full(shape, 2, np.int16))
+    surface = load_ground_truth(tiny_pair).sessions["before"].surface
+    assert surface is not None and (surface.displacement_m == 0.25).all() and (surface.change == 2).all()
+    assert len(list(tiny_pair.glob("*/truth/scoring_points.npz"))) == 2
