@@ -25,6 +25,8 @@ PERMISSIVE = (
 )  # fmt: skip
 ACCEPTED = {
     "embreex": "its field holds the text of the BSD licence with two clauses",
+    "mlcroissant": "Apache-2.0 in its repository, while its metadata name none; tests and the extra `croissant` alone",
+    "pyoctomap": "its field holds the text of the MIT licence; the extra `octomap` alone",
     "ouster_sdk": "BSD-3-Clause, and in its wheel parts under the vendor's freeware licence; the extra `ouster` alone",
     "zeroconf": "LGPL, an unchanged library that the vendor's SDK requires; the extra `ouster` alone",
 }
