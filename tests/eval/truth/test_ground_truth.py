@@ -20,7 +20,15 @@ from eval.truth.ground_truth import (
     load_ground_truth,
 )
 from eval.truth.scoring_points import ScoringPoints
-from sim.session.truth import MoverTrack, PairTruth, write_mover_track, write_surface_labels
+from sim.session.truth import (
+    MoverTrack,
+    MoverTruth,
+    PairTruth,
+    read_pair_truth,
+    write_mover_track,
+    write_pair_truth,
+    write_surface_labels,
+)
 from tests.eval.changes import change
 from tests.eval.conftest import CHUNK_SCANS
 
@@ -113,6 +121,18 @@ def test_movers_are_seen_where_they_have_returns(tmp_path: Path) -> None:
     np.testing.assert_array_equal(_load_seen_movers(tmp_path, 2, 3), seen_world[[0, 0, 1], [1, 2, 0]])
     with pytest.raises(InputError, match="it has 2 movers and 3 revolutions, expected 2 and 4"):
         _load_seen_movers(tmp_path, 2, 4)
+
+
+def test_a_mover_of_one_session_is_looked_for_there(tiny_pair: Path) -> None:
+    n_scans = load_ground_truth(tiny_pair).sessions["after"].scoring_points.n_scans
+    mover = MoverTruth("worker", "person", 3, "after", stretch_m=0.0, moving_share=0.0, n_returns=n_scans)
+    write_pair_truth(tiny_pair, replace(read_pair_truth(tiny_pair), movers=(mover,)))
+    track = MoverTrack(
+        np.tile(np.eye(4), (1, n_scans, 1, 1)), np.ones((1, n_scans), np.int32), np.ones((1, n_scans, 3))
+    )
+    write_mover_track(tiny_pair / "after", track)
+    sessions = load_ground_truth(tiny_pair).sessions
+    assert [len(sessions[name].seen_movers_world) for name in ("before", "after")] == [0, n_scans]
 
 
 def test_movements_come_with_the_truth_of_a_pair(tiny_pair: Path) -> None:
