@@ -22,6 +22,7 @@ FALSE_SHARE = 0.05
 # a factor of sqrt 2 to either side of 5, 10, 20, 40, 80 and 160 mm; the last bin also holds all that is larger
 MAGNITUDES_M = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)
 EDGES_M = (*(round(float(each / np.sqrt(2)), 6) for each in MAGNITUDES_M), 5.0)
+# of 40 independent windows at 5 % each more than 15 % have a chance of 0.3 %, more than 10 % one of 5 %
 MOST_FALSE = 0.15
 _ROUNDING_M = 1e-9  # means of one value over more or fewer places differ by rounding
 _HALF = 0.5
