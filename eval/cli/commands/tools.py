@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from eval.cli.options import AsJson, JsonFile, Quiet, complete_any
-from eval.core.printing import (
+from eval.core.terminal.printing import (
     LINE,
     MET,
     echo,
@@ -56,7 +56,7 @@ def bench(
     from eval.bench.bench import choose, list_contests, measure, require_writable
     from eval.bench.growth import choose_axes, measure_growth, write_growth
     from eval.bench.profile import SITES, measure_profile, write_markdown
-    from eval.core.progress import Lines, Silent
+    from eval.core.terminal.progress import Lines, Silent
 
     _require_one_table(growth=growth, profile=profile, surface=surface, quick=quick, large=large)
     if out is not None:

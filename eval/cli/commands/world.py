@@ -20,8 +20,8 @@ from eval.cli.options import (
     join_world_settings,
     world_mistakes,
 )
-from eval.core.printing import LINE, echo, print_table, say, shown_warnings
-from eval.core.progress import shown_progress
+from eval.core.terminal.printing import LINE, echo, print_table, say, shown_warnings
+from eval.core.terminal.progress import shown_progress
 
 
 def simulate(

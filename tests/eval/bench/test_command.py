@@ -13,7 +13,7 @@ from eval.bench.bench import choose, list_contests, list_reasons, make_row, meas
 from eval.bench.merge import FailedContest
 from eval.cli.commands.tools import _print_growth, _print_speed
 from eval.cli.main import main
-from eval.core.printing import LINE
+from eval.core.terminal.printing import LINE
 from sim.studies.bench import BenchSite
 from sim.studies.timing import Contest, SkippedContest
 

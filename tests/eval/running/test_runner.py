@@ -25,7 +25,7 @@ from cdpipe.model.config import MapConfig
 from cdpipe.pipeline import Done
 from cdpipe.sensor.ouster import load_profile
 from eval.core.output import remove
-from eval.core.progress import Silent
+from eval.core.terminal.progress import Silent
 from eval.plans.cells import expand_cells
 from eval.plans.changes import change_plan
 from eval.plans.plan import Plan, load_plan
