@@ -12,7 +12,7 @@ import typer
 if TYPE_CHECKING:
     from cdpipe.io.foreign import HowToRead
     from cdpipe.model.types import ScanSource
-    from eval.core.progress import RunProgress
+    from eval.core.terminal.progress import RunProgress
 
 RECORDING = "session folder, or a recording: scans with a trajectory, bag, MCAP, E57, OSF, PCAP"
 Format = Annotated[

@@ -15,8 +15,8 @@ from typer.core import TyperGroup
 
 from cdpipe.core.threads import fix_threads
 from eval.cli.commands import converting, leaderboard, pair, run, stories, tools, tracing, training, viewing, world
-from eval.core.exits import input_errors, run_app
-from eval.core.printing import echo
+from eval.core.terminal.exits import input_errors, run_app
+from eval.core.terminal.printing import echo
 
 
 class _Funnel(TyperGroup):

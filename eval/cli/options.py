@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import typer
 
 from cdpipe.core.errors import InputError, ScenarioError
-from eval.core.printing import warn
+from eval.core.terminal.printing import warn
 
 
 def _completed(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:

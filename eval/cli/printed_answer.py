@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from eval.core.printing import LINE, echo, echo_wrapped, print_table
+from eval.core.terminal.printing import LINE, echo, echo_wrapped, print_table
 
 if TYPE_CHECKING:
     from cdpipe.model.report import ChangeReport

@@ -9,12 +9,12 @@ from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
-from eval.core.printing import LINE, MET, echo, echo_wrapped, print_fitted, print_row, print_table
+from eval.core.terminal.printing import LINE, MET, echo, echo_wrapped, print_fitted, print_row, print_table
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from eval.report.comparison import Comparison
+    from eval.report.comparing.page import Comparison
 
     _Table = tuple[str, pd.DataFrame, Sequence[Sequence[str]]]  # title, rows, columns that give way
 
@@ -167,7 +167,7 @@ def _name_files(folder: Path) -> str:
 def _region_results(folder: Path, printer: _Printer) -> None:
     import pandas as pd
 
-    from eval.tables.region_table import region_overview
+    from eval.tables.regions.table import region_overview
 
     printer.print(
         "regions: means over pairs, in and out of distribution; recall@0.1 is at 0.1 false regions per 100 m",
@@ -199,7 +199,7 @@ def _object_results(folder: Path, printer: _Printer) -> None:
 
 def print_comparison(found: Comparison) -> None:
     """Print what moved between two runs, and the sentences about it."""
-    from eval.report.comparison import MOVED, overview, sentences
+    from eval.report.comparing.page import MOVED, overview, sentences
 
     table = overview(found.table)
     title = f"A: {found.names[0]}; B: {found.names[1]}; means over session pairs, B - A pair by pair"

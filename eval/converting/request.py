@@ -9,7 +9,7 @@ from cdpipe.io.out.scans import Outgoing
 from cdpipe.io.session import Session
 from cdpipe.model.types import ScanSource
 from eval.converting.truth import truth_fields
-from eval.core.progress import RunProgress
+from eval.core.terminal.progress import RunProgress
 
 
 @dataclass(frozen=True, slots=True)

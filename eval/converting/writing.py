@@ -13,7 +13,7 @@ from eval.converting.formats import FORMATS, OutFormat
 from eval.converting.request import Request
 from eval.converting.writers import require_formats
 from eval.core.output import new_files, new_folder, unwritable
-from eval.core.progress import RunProgress
+from eval.core.terminal.progress import RunProgress
 
 
 def write_session(request: Request, out: Path, name: str) -> str:

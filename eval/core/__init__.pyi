@@ -1,10 +1,10 @@
 from .cluster import HERE, Where
 from .domains import domain_of, is_change_in_distribution
-from .exits import run_program
 from .output import make_writable, new_folder
-from .progress import RunProgress, Silent, shown_progress
 from .provenance import git_commit
 from .statistics import bootstrap_interval, mean_with_interval, summarise, wilson_interval
+from .terminal.exits import run_program
+from .terminal.progress import RunProgress, Silent, shown_progress
 
 __all__ = [
     "HERE",

@@ -22,8 +22,8 @@ from urllib.parse import urlsplit
 from cdpipe.core.errors import InputError
 from cdpipe.core.threads import THREAD_VARIABLES, THREADS, fix_threads
 from eval.core.exposure import is_loopback
-from eval.core.interrupts import interrupts_held
 from eval.core.provenance import versions
+from eval.core.terminal.interrupts import interrupts_held
 
 # By this variable Dask's workers return freed memory to the system at once, which takes a quarter of a pair's time.
 _ENVIRONMENT, _TRIM = "distributed.nanny.pre-spawn-environ", "MALLOC_TRIM_THRESHOLD_"

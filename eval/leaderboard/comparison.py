@@ -12,11 +12,11 @@ import numpy as np
 import pandas as pd
 
 from eval.core.output import make_writable
-from eval.core.printing import count_pairs
 from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
+from eval.core.terminal.printing import count_pairs
 from eval.leaderboard.reference import take_other_methods
-from eval.report.compared_columns import COMPARED, figures_of, is_time
-from eval.report.comparing import paired_differences, verdict
+from eval.report.comparing.columns import COMPARED, figures_of, is_time
+from eval.report.comparing.differences import paired_differences, verdict
 from eval.report.render import write_file
 from eval.running.results.run_data import RunData
 from eval.running.results.sides import find_other_worlds

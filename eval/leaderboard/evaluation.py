@@ -31,8 +31,8 @@ from cdpipe.core.names import path_part
 from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.io.answer import write_failure
 from eval.core.output import remove
-from eval.core.progress import RunProgress, Silent
 from eval.core.provenance import digest
+from eval.core.terminal.progress import RunProgress, Silent
 from eval.leaderboard.command import digest_programs, run_command
 from eval.leaderboard.given_merge import MergeMode, write_merge
 from eval.plans.plan import Plan

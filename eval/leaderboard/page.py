@@ -12,7 +12,7 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from eval.core.output import made_parents, require_replaceable
-from eval.core.printing import count_pairs
+from eval.core.terminal.printing import count_pairs
 from eval.leaderboard.comparison import (
     FIGURES,
     HEADINGS,

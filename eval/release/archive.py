@@ -18,7 +18,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files import list_members, read_member, require_plain_file
 from cdpipe.core.names import LONGEST, visible
 from eval.core.output import copy_folder, new_folder, whole_file
-from eval.core.progress import RunProgress, Silent
+from eval.core.terminal.progress import RunProgress, Silent
 
 SESSIONS, TRUTH, SUMS = "sessions", "truth", "SHA256SUMS"
 _MOST_BYTES = 4 << 30

@@ -24,7 +24,7 @@ from pydantic import TypeAdapter
 from cdpipe.core.errors import InputError, ScenarioError
 from eval.core.cluster import HERE, Where, connected, require_usable
 from eval.core.output import made_parents, make_writable, remove, require_no_links, whole_file
-from eval.core.progress import RunProgress, Silent
+from eval.core.terminal.progress import RunProgress, Silent
 from eval.release.archive import SESSIONS, SUMS, TRUTH, list_files, pack, read_sums, write_sums
 from eval.release.card import write_release_card
 from eval.release.content import Release, ReleasePair

@@ -18,8 +18,8 @@ import pandas as pd
 
 from cdpipe.core.names import visible
 from eval.core.statistics import paired_difference
-from eval.report.compared_columns import COMPARED, POOLED
-from eval.report.comparing import BETTER, WORSE, pooled_difference, verdict
+from eval.report.comparing.columns import COMPARED, POOLED
+from eval.report.comparing.differences import BETTER, WORSE, pooled_difference, verdict
 from eval.report.objects.tables import OBJECT_COLUMNS
 from eval.report.regions.regions import REGION_COLUMNS
 from eval.report.summary import is_unmade, means_by_method

@@ -20,8 +20,8 @@ from cdpipe.core.errors import InputError
 from cdpipe.model.config import settings_table
 from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.core.output import require_no_links
-from eval.core.progress import RunProgress
 from eval.core.statistics import ENOUGH_PAIRS
+from eval.core.terminal.progress import RunProgress
 from eval.plans.targets import read_targets
 from eval.report.cost import draw_pareto, pareto_table
 from eval.report.drawing.charts import Chart

@@ -12,7 +12,7 @@ import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
 from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
-from eval.report.compared_columns import COMPARED, POOLED, figures_of, is_time
+from eval.report.comparing.columns import COMPARED, POOLED, figures_of, is_time
 from eval.report.merge.tables import name_kinds
 from eval.report.surface.surface import SURFACE_COLUMNS
 from eval.report.tables import Cell, Table, methods_table, written_interval
@@ -26,7 +26,7 @@ from eval.scoring.surface_windows import AREAS_M2
 from eval.tables.columns import Column, fine, select, share, spaced
 from eval.tables.merge_table import ALL_FAMILIES, RIGHT_DEG, RIGHT_M
 from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, by_domain, is_told_the_truth, numbers, records, with_domain
-from eval.tables.surface_table import limit_column
+from eval.tables.surface.table import limit_column
 
 _MAX_METHODS = 8
 HEADLINES = select(

@@ -26,7 +26,7 @@ from cdpipe.core.files import read_json
 from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.io.session import SessionWriter, read_session
 from eval.core.output import copy_folder, make_writable, new_folder
-from eval.core.progress import RunProgress, Silent
+from eval.core.terminal.progress import RunProgress, Silent
 from eval.running.rescoring import foreign_identity
 from eval.running.runfolder import RunFolder, write_json
 from eval.running.scaling.keeping import list_dropped

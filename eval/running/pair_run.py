@@ -26,8 +26,8 @@ from cdpipe.methods.registry import PACKAGES, list_extras
 from cdpipe.model.config import WEIGHTS, MapConfig
 from eval.core.domains import domain_of
 from eval.core.output import remove, whole_file
-from eval.core.progress import RunProgress
 from eval.core.provenance import canonical_json, digest_parts, git_commit, now
+from eval.core.terminal.progress import RunProgress
 from eval.graft import make_pair
 from eval.oracles.merge import merged_by_truth
 from eval.oracles.regions import regions_by_truth

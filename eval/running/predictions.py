@@ -23,8 +23,8 @@ from cdpipe.core.names import folded, require_table_name, visible
 from cdpipe.core.yamlfile import suggest
 from cdpipe.model.config import preset_names
 from eval.core.output import copy_folder, remove
-from eval.core.progress import RunProgress, Silent
 from eval.core.tablefile import read_table
+from eval.core.terminal.progress import RunProgress, Silent
 from eval.plans.cells import list_planned_cases
 from eval.plans.coverage import read_stored_plan
 from eval.running.cell_file import LAST, NO_KEY, cell_document

@@ -9,7 +9,7 @@ from typing import Any
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import require_table_name, visible
-from eval.core.progress import RunProgress, Silent
+from eval.core.terminal.progress import RunProgress, Silent
 from eval.running.cell_file import LAST, NO_KEY, cell_document
 from eval.running.cell_rows import IDENTITY
 from eval.running.runfolder import RunFolder, write_json, write_tables

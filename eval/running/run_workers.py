@@ -24,7 +24,7 @@ from pydantic import TypeAdapter, ValidationError
 from cdpipe.core.errors import InputError
 from cdpipe.core.isolation import ProcessDiedError, run_isolated
 from eval.core.cluster import is_shared, n_slots
-from eval.core.progress import RunProgress, Silent
+from eval.core.terminal.progress import RunProgress, Silent
 from eval.running.pair_run import Made, Pair, PairRun, Todo, cell_key, is_finished, pair_lock
 from eval.running.runfolder import RunFolder
 from eval.running.scaling.keeping import drop_pair

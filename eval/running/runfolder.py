@@ -11,12 +11,12 @@ results.csv changes.csv regions.csv objects.csv keyframes.csv summary.csv
 surface_changes.csv surface_windows.csv       where rock moved, or an answer says so
 merge.csv                                     where pairs have a kind (eval.tables.merge_table)
 regions_table.csv regions_targets.csv regions_by_size.csv budgets.csv roc.csv froc.csv
-                                              where the plan says `report: regions` (eval.tables.region_table)
+                                              where the plan says `report: regions` (eval.tables.regions.table)
 hard.csv breaking_points.csv                  where its plan has axes (eval.tables.hardness)
 objects_table.csv objects_by_group.csv objects_targets.csv
                                               where it says `report: objects` (eval.tables.object_table)
 surface_table.csv surface_targets.csv detection_limits.csv
-                                              where it says `report: surface` (eval.tables.surface_table)
+                                              where it says `report: surface` (eval.tables.surface.table)
 effects.csv                                   where a world was run with and without a setting (eval.tables.effects)
 """
 
@@ -53,10 +53,10 @@ from eval.tables.hardness import breaking_points, hardness_table
 from eval.tables.merge_table import merge_table
 from eval.tables.object_table import FILES as OBJECT_FILES
 from eval.tables.object_table import object_tables
-from eval.tables.region_table import FILES as REGION_FILES
-from eval.tables.region_table import region_tables
-from eval.tables.surface_table import FILES as SURFACE_FILES
-from eval.tables.surface_table import surface_tables
+from eval.tables.regions.table import FILES as REGION_FILES
+from eval.tables.regions.table import region_tables
+from eval.tables.surface.table import FILES as SURFACE_FILES
+from eval.tables.surface.table import surface_tables
 
 _MAP_CELL_M = 0.1  # pictures number no smaller cells
 _MAPS = {"before_points": ArraySpec("N,3", "float32"), "after_points": ArraySpec("M,3", "float32")}

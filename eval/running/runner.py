@@ -21,8 +21,8 @@ from cdpipe.methods.registry import load_source
 from cdpipe.surface.measure import require_method
 from eval.core.cluster import HERE, Where, connected, require_usable
 from eval.core.output import remove
-from eval.core.progress import RunProgress, Silent
 from eval.core.provenance import describe_run, digest
+from eval.core.terminal.progress import RunProgress, Silent
 from eval.plans.cells import expand_cells
 from eval.plans.plan import Plan
 from eval.plans.variants import Cell

@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import groupby
 
 from cdpipe.core.errors import InputError, ScenarioError
-from eval.core.progress import RunProgress, Silent
+from eval.core.terminal.progress import RunProgress, Silent
 from eval.plans.plan import Plan
 from eval.plans.variants import Cell
 from eval.plans.worlds import world_slug

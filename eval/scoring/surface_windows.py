@@ -1,7 +1,7 @@
 """Windows for detection limits: discs of the before surface that the harness chooses, and the mean displacement there.
 
 A window of a change lies on one surface change, wholly where the change is large enough. A null window holds no place
-that moved. `eval.tables.surface_limits` turns the windows of a run into detection limits.
+that moved. `eval.tables.surface.limits` turns the windows of a run into detection limits.
 """
 
 from __future__ import annotations

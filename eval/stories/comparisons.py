@@ -21,8 +21,8 @@ from cdpipe.io.answer import Answer, read_answer, write_failure
 from cdpipe.io.session import is_session
 from cdpipe.model.config import PipelineConfig, Site
 from eval.core.output import make_writable, new_folder, require_no_links
-from eval.core.progress import RunProgress
 from eval.core.provenance import digest, versions
+from eval.core.terminal.progress import RunProgress
 from eval.running.runfolder import write_json
 from eval.scoring.scoring import CaseScore, score_stored
 from eval.truth.ground_truth import GroundTruth, load_ground_truth

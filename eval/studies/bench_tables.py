@@ -17,8 +17,8 @@ import typer
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files.json_file import read_json
-from eval.core.exits import run_program
 from eval.core.output import unwritable, whole_file
+from eval.core.terminal.exits import run_program
 from eval.studies.reality.tables import format_markdown
 
 _FIGURES = {"name", "value", "unit", "rival", "rival_value", "ratio", "target", "met", "reason"}

@@ -22,10 +22,10 @@ import typer
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.model.config import load_config
-from eval.core.exits import run_program
-from eval.core.printing import echo
 from eval.core.tablefile import read_table as read_stored_table
 from eval.core.tablefile import table_file
+from eval.core.terminal.exits import run_program
+from eval.core.terminal.printing import echo
 from eval.plans.coverage import read_stored_plan
 from eval.running.runfolder import read_json
 

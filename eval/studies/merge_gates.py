@@ -25,10 +25,10 @@ from cdpipe.core.geometry import BoolArray, Float64Array, stream
 from cdpipe.merge.evidence import GATES
 from cdpipe.model.config import load_config
 from eval.core.charts import BLACK, BLUE, VERMILLION, Axis, Drawing, Look, Panel, Series, log_span, named_ticks
-from eval.core.exits import run_program
 from eval.core.figures import picture, png
 from eval.core.output import make_writable
-from eval.core.printing import echo
+from eval.core.terminal.exits import run_program
+from eval.core.terminal.printing import echo
 from eval.plans.cells import expand_cells
 from eval.plans.coverage import read_stored_plan
 from eval.running.runfolder import read_json

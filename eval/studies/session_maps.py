@@ -29,9 +29,9 @@ from cdpipe.mapping.movers import find_movers
 from cdpipe.methods.dufomap import UNKNOWN_VOXELS, load_dufomap, origin_pose
 from cdpipe.model.config import PipelineConfig, load_config
 from cdpipe.model.types import PointMap, ScanSource, SessionName
-from eval.core.exits import run_program
 from eval.core.output import whole_file
-from eval.core.printing import echo
+from eval.core.terminal.exits import run_program
+from eval.core.terminal.printing import echo
 from sim.session.truth import read_labels, read_pair_truth
 
 SESSIONS: tuple[SessionName, SessionName] = ("before", "after")

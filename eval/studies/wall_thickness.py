@@ -22,8 +22,8 @@ from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.poses.consistency import make_consistent
 from cdpipe.model.types import ScanSource, SessionName
-from eval.core.exits import run_program
-from eval.core.printing import echo
+from eval.core.terminal.exits import run_program
+from eval.core.terminal.printing import echo
 from sim.session.truth import read_true_poses
 
 SESSIONS: tuple[SessionName, SessionName] = ("before", "after")

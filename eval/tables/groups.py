@@ -12,7 +12,7 @@ import pandas as pd
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from eval.core.statistics import N_RESAMPLES, Statistic, interval_of, mean, median
 from eval.tables.conditions import told_apart
-from eval.tables.region_curves import RankedPairs, found_at
+from eval.tables.regions.curves import RankedPairs, found_at
 from eval.tables.rows import PAIR, numbers, texts
 
 RATE_PER_100M = 0.1

@@ -15,7 +15,7 @@ import pandas as pd
 from eval.core.statistics import interval_of, mean
 from eval.plans.axes import Step, world_of_step
 from eval.plans.plan import Plan, list_methods, with_step
-from eval.tables.region_curves import ranked_pairs, recall_at, resampled_recalls
+from eval.tables.regions.curves import ranked_pairs, recall_at, resampled_recalls
 from eval.tables.rows import numbers
 
 FILES = ("hard", "breaking_points")

@@ -15,7 +15,7 @@ import pandas as pd
 from eval.core.statistics import mean_with_interval, median
 from eval.plans.targets import PROPOSED, RATE_COLUMN, Target, Targets
 from eval.tables.conditions import ANY, by_condition, odometry_of, of_condition
-from eval.tables.region_curves import RankedPairs, recall_difference
+from eval.tables.regions.curves import RankedPairs, recall_difference
 from eval.tables.rows import numbers, records, texts
 
 COLUMNS = ("target", "domain", "variant", "value", "low", "high", "asked", "n", "is_met")

@@ -22,7 +22,7 @@ from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.training.shard import FORMAT, FORMAT_VERSION, SUFFIX, read_about
 from eval.core.cluster import HERE, Where, connected, n_slots, require_usable
 from eval.core.output import make_writable, whole_file
-from eval.core.progress import RunProgress, Silent
+from eval.core.terminal.progress import RunProgress, Silent
 from eval.plans.seeds import parse_seeds_option
 from eval.plans.worlds import world_slug
 from eval.running.runfolder import read_json, write_json

@@ -27,8 +27,8 @@ from cdpipe.training.sphere_training import SphereTask, read_sphere_data
 from eval.core.charts import BLUE, VERMILLION, Axis, Drawing, Look, Panel, Series
 from eval.core.figures import picture, png
 from eval.core.output import make_writable, whole_file
-from eval.core.progress import RunProgress
 from eval.core.provenance import git_commit
+from eval.core.terminal.progress import RunProgress
 
 SOURCES = {
     "sphere": "what the map around a keyframe looks like, 64 numbers (cdpipe.descriptors.sphere_network)",

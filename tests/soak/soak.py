@@ -109,6 +109,13 @@ COMMANDS: Mapping[str, Written] = {
     "train 3deg": Written(
         "train data --descriptor 3deg --steps 2 --threads 1 --out weights", "weights", {"data": "dataset/data"}
     ),
+    "simulate a story": Written(
+        f"simulate smoke/one_box --sessions 3 --seed 20000 {_WORLD} --out story", "story", is_once=True
+    ),
+    "pair of a story": Written("pair story 1 3 --out pair", "pair", {"story": "simulate a story/story"}, is_once=True),
+    "story": Written("story story --out page", "page", {"story": "simulate a story/story"}),
+    "graft": Written("graft pair/before --out grafted", "grafted", {"pair": "simulate/pair"}, is_once=True),
+    "export": Written("export run --with-truth --out copy", "copy", {"run": "run/run"}),
     "report": Written("report run", "run", {"run": "run/run"}),
     "score a run": Written("score run", "run", {"run": "run/run"}),
     "score predictions": Written(

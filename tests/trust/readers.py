@@ -45,7 +45,7 @@ from eval.leaderboard.submission import pack_submission, read_submission
 from eval.plans.cells import expand_cells
 from eval.plans.plan import load_plan
 from eval.release.archive import pack, unpack_release, write_sums
-from eval.report.comparison import compare_sides
+from eval.report.comparing.page import compare_sides
 from eval.report.page import write_page
 from eval.running.cell_file import LAST, NO_KEY, cell_document
 from eval.running.export import name_blindly

@@ -22,8 +22,8 @@ from eval.cli.inputs import (
     open_sources,
 )
 from eval.cli.options import Quiet, SetSettings
-from eval.core.printing import say, shown_warnings
-from eval.core.progress import RunProgress, shown_progress
+from eval.core.terminal.printing import say, shown_warnings
+from eval.core.terminal.progress import RunProgress, shown_progress
 
 if TYPE_CHECKING:
     from cdpipe.io.foreign import HowToRead

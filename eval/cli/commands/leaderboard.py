@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 import typer
 
 from eval.cli.options import Quiet, RunOut, complete_plan
-from eval.core.printing import count_pairs, echo, say
-from eval.core.progress import shown_progress
+from eval.core.terminal.printing import count_pairs, echo, say
+from eval.core.terminal.progress import shown_progress
 
 
 def template(

@@ -24,8 +24,8 @@ from eval.cli.inputs import (
 )
 from eval.cli.options import KindOfSite, OutFolder, Preset, Quiet, SetSettings, require_method_settings
 from eval.cli.printed_answer import print_answer
-from eval.core.printing import LINE, echo, print_table, say, shown_warnings
-from eval.core.progress import shown_progress
+from eval.core.terminal.printing import LINE, echo, print_table, say, shown_warnings
+from eval.core.terminal.progress import shown_progress
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -26,8 +26,8 @@ from eval.cli.options import (
     require_method_settings,
 )
 from eval.cli.printed_results import print_comparison, print_pair_row, print_results, print_summary
-from eval.core.printing import echo, require_json_file, say, tell_json, warn
-from eval.core.progress import shown_progress
+from eval.core.terminal.printing import echo, require_json_file, say, tell_json, warn
+from eval.core.terminal.progress import shown_progress
 
 if TYPE_CHECKING:
     from eval.core.cluster import Where
@@ -282,7 +282,7 @@ def report(
         raise InputError("--sharp: the page of a comparison has no pictures to compress: leave it out")
     if other is not None and against is not None:
         raise InputError(f"--against {against}: a second run is named too: write {folder}:{against} {other} instead")
-    from eval.report.comparison import compare_sides, write_comparison
+    from eval.report.comparing.page import compare_sides, write_comparison
     from eval.running.results.sides import read_side
 
     first, second = (folder, other) if other is not None else (f"{folder}:{against}", folder)

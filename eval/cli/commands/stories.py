@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from eval.cli.options import KindOfSite, OutFolder, Preset, Quiet, SetSettings
-from eval.core.printing import echo, print_table, say, shown_warnings
-from eval.core.progress import shown_progress
+from eval.core.terminal.printing import LINE, echo, print_table, say, shown_warnings
+from eval.core.terminal.progress import shown_progress
 
 if TYPE_CHECKING:
     from cdpipe.core.geometry import Float64Array
@@ -64,7 +64,7 @@ def story_command(
     if moved.empty:
         say(quiet, "no region of rock moved in any session")
     elif not quiet:
-        print_table("displacement since session 1, mm, and 95 % level of detection", moved)
+        print_table("displacement since session 1, mm, and 95 % level of detection", moved, LINE)
     echo(f"page: {out / 'index.html'}")
 
 

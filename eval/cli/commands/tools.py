@@ -3,14 +3,32 @@
 # ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from eval.cli.options import AsJson, JsonFile, Quiet, complete_any
-from eval.core.printing import LINE, MET, echo, line_width, print_table, require_json_file, tell_json
+from eval.core.terminal.printing import (
+    LINE,
+    MET,
+    echo,
+    echo_wrapped,
+    line_width,
+    print_fitted,
+    require_json_file,
+    tell_json,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_SPEED_GIVES_WAY = (("n", "spread"), ("rival_value",), ("rival",))
+_GROWTH_GIVES_WAY = (("peak_mb", "wall_s"), ("smallest", "first"), ("largest", "last"))
+_DECIMALS_OF_EXPONENTS = {"exponent": 2, "low": 2, "high": 2, "last": 2}
 
 
 def bench(
@@ -38,7 +56,7 @@ def bench(
     from eval.bench.bench import choose, list_contests, measure, require_writable
     from eval.bench.growth import choose_axes, measure_growth, write_growth
     from eval.bench.profile import SITES, measure_profile, write_markdown
-    from eval.core.progress import Lines, Silent
+    from eval.core.terminal.progress import Lines, Silent
 
     _require_one_table(growth=growth, profile=profile, surface=surface, quick=quick, large=large)
     if out is not None:
@@ -84,9 +102,13 @@ def _print_speed(table: dict[str, Any], written: list[Path]) -> None:
 
     from eval.bench.bench import list_reasons, summarise
 
-    shown = pd.DataFrame(table["rows"]).assign(met=[MET[row["met"]] for row in table["rows"]]).drop(columns="reason")
-    print_table(f"speed, {_machine(table)}; ratio: times faster than the rival", shown)
-    echo(*list_reasons(table["rows"]), _with_files(summarise(table["rows"]), written))
+    rows = pd.DataFrame(table["rows"])
+    value = [_with_unit(*each) for each in zip(rows["value"], rows["unit"], strict=True)]
+    shown = rows.assign(value=value, met=rows["met"].map(MET.get)).drop(columns=["reason", "unit"])
+    _print_fitted(f"speed, {_machine(table)}; ratio: times faster than the rival", shown, _SPEED_GIVES_WAY)
+    for line in [*list_reasons(table["rows"]), summarise(table["rows"])]:
+        echo_wrapped(line, LINE)
+    _tell_files(written)
 
 
 def _print_growth(table: dict[str, Any], written: list[Path]) -> None:
@@ -94,25 +116,38 @@ def _print_growth(table: dict[str, Any], written: list[Path]) -> None:
 
     from eval.bench.growth import summarise_growth
 
-    shown = pd.DataFrame(table["rows"]).drop(columns=["axis", "n"])
-    print_table(f"growth, {_machine(table)}; figure = c * size ** exponent; low, high: 95 %; last: last step", shown)
-    echo(_with_files(summarise_growth(table), written))
+    rows = pd.DataFrame(table["rows"])
+    value = [_with_unit(*each) for each in zip(rows["value"], rows["unit"], strict=True)]
+    shown = rows.assign(value=value).drop(columns=["grows", "unit", "n"])
+    title = f"growth, {_machine(table)}; figure = c * size ** exponent (low, high: 95 %)"
+    _print_fitted(title, shown.round(_DECIMALS_OF_EXPONENTS), _GROWTH_GIVES_WAY)
+    echo_wrapped(summarise_growth(table), LINE)
+    _tell_files(written)
 
 
 def _print_profile(table: dict[str, Any], written: list[Path]) -> None:
     import pandas as pd
 
-    print_table(f"profile, {_machine(table)}; share: of the command's CPU time", pd.DataFrame(table["rows"]))
-    if written:
-        echo(_with_files("written", written))
+    _print_fitted(f"profile, {_machine(table)}; share: of the command's CPU time", pd.DataFrame(table["rows"]))
+    _tell_files(written)
+
+
+def _print_fitted(title: str, table: pd.DataFrame, gives_way: Sequence[Sequence[str]] = ()) -> None:
+    left_out = print_fitted(title, table, gives_way)
+    if left_out:
+        echo_wrapped(f"left out: {', '.join(left_out)}; --json and --out FILE.json have all", LINE)
+
+
+def _with_unit(value: float | None, unit: str) -> str:
+    return "-" if value is None or math.isnan(value) else f"{value:.3g} {unit}"
 
 
 def _machine(table: dict[str, Any]) -> str:
     return f"{table['machine']['cpu']}, {table['machine']['cores']} cores"
 
 
-def _with_files(told: str, written: list[Path]) -> str:
-    return "; ".join([told, *map(str, written)])
+def _tell_files(written: list[Path]) -> None:
+    echo(*(f"written: {file}" for file in written))
 
 
 def list_command(

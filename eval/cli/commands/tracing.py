@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 import typer
 
 from eval.cli.options import Quiet
-from eval.core.printing import say, warn
-from eval.core.progress import shown_progress
+from eval.core.terminal.printing import say, warn
+from eval.core.terminal.progress import shown_progress
 
 
 def trace(

@@ -21,8 +21,8 @@ from eval.cli.options import (
     join_world_settings,
     world_mistakes,
 )
-from eval.core.printing import count_pairs, say, warn
-from eval.core.progress import shown_progress
+from eval.core.terminal.printing import count_pairs, say, warn
+from eval.core.terminal.progress import shown_progress
 
 if TYPE_CHECKING:
     from eval.core.cluster import Where

@@ -31,8 +31,8 @@ from eval.cli.options import (
     join_world_settings,
     world_mistakes,
 )
-from eval.core.printing import echo, say, shown_warnings, warn
-from eval.core.progress import RunProgress, shown_progress
+from eval.core.terminal.printing import echo, say, shown_warnings, warn
+from eval.core.terminal.progress import RunProgress, shown_progress
 
 if TYPE_CHECKING:
     from cdpipe.io.foreign import HowToRead

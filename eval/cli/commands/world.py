@@ -20,8 +20,8 @@ from eval.cli.options import (
     join_world_settings,
     world_mistakes,
 )
-from eval.core.printing import echo, print_table, say, shown_warnings
-from eval.core.progress import shown_progress
+from eval.core.terminal.printing import LINE, echo, print_table, say, shown_warnings
+from eval.core.terminal.progress import shown_progress
 
 
 def simulate(
@@ -151,7 +151,7 @@ def survey(
         echo(*as_markdown(found).split("\n"))
     elif not quiet:
         table = pd.DataFrame([summary(one) for one in found]).T.reset_index()
-        print_table("figures", table.iloc[1:].set_axis(["", *families], axis=1))
+        print_table("figures", table.iloc[1:].set_axis(["", *families], axis=1), LINE)
     failures = [failure for one in found for failure in one.failures]
     for failure in failures:
         echo(f"failed: {failure.family}, seed {failure.seed}: {failure.reason}")

@@ -14,7 +14,7 @@ from eval.core.domains import domain_name
 from eval.report.drawing.charts import Chart
 from eval.report.drawing.looks import line_of, look_of
 from eval.tables.columns import EN_DASH, share
-from eval.tables.region_curves import RATES_PER_100M
+from eval.tables.regions.curves import RATES_PER_100M
 from eval.tables.rows import ALL_DOMAINS
 
 _FAINT, _LIMIT = Look("#d0d0d0", 0.8), Look("#c4c4c4", 0.8)

@@ -20,8 +20,8 @@ from eval.running.runfolder import reported
 from eval.scoring.surface_windows import AREAS_M2
 from eval.tables.columns import Column, scaled, select, share, significant
 from eval.tables.rows import ALL_DOMAINS, is_told_the_truth, with_domain
-from eval.tables.surface_limits import EDGES_M, MAGNITUDES_M
-from eval.tables.surface_table import limit_column
+from eval.tables.surface.limits import EDGES_M, MAGNITUDES_M
+from eval.tables.surface.table import limit_column
 
 _mm = scaled(1000.0)
 _CAPTION = "Rock that moved: one row is one method on the pairs in or out of the training distribution"

@@ -20,8 +20,8 @@ from typing import Any, Literal
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_json, read_npz
 from eval.core.output import copy_folder, new_folder
-from eval.core.progress import RunProgress, Silent
 from eval.core.provenance import digest, now
+from eval.core.terminal.progress import RunProgress, Silent
 from eval.plans.cells import list_planned_cases
 from eval.plans.coverage import read_stored_plan
 from eval.running.cell_rows import ITEM_TABLES, SURFACE_TABLES

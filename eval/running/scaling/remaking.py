@@ -11,7 +11,7 @@ from pathlib import Path
 from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import Document, validate
 from eval.core.output import remove
-from eval.core.progress import RunProgress, Silent
+from eval.core.terminal.progress import RunProgress, Silent
 from eval.running.pair_run import TOOLS, Tools, pair_lock_of, write_maps
 from eval.running.runfolder import RunFolder
 from eval.running.scaling.keeping import Dropped, dropped_file, read_dropped, remove_pair, require_same_bytes

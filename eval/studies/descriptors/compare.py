@@ -22,11 +22,11 @@ from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import checkpoint_digest, list_checkpoints, sphere_digest, use_threads
 from cdpipe.model.config import load_config
 from eval.core.domains import domain_of
-from eval.core.exits import run_program
 from eval.core.output import make_writable, remove
-from eval.core.progress import RunProgress, shown_progress
 from eval.core.provenance import digest, git_commit, machine
 from eval.core.statistics import bootstrap_interval, mean_with_interval, median
+from eval.core.terminal.exits import run_program
+from eval.core.terminal.progress import RunProgress, shown_progress
 from eval.plans.seeds import parse_seeds_option
 from eval.plans.worlds import world_slug
 from eval.running.runfolder import read_json, write_json

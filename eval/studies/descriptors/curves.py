@@ -37,11 +37,11 @@ from cdpipe.training.data import TunnelShard, open_dataset
 from cdpipe.training.fit import FitConfig, fit
 from cdpipe.training.shard import read_shard
 from cdpipe.training.sphere_training import SphereData, SphereTask, local_scores, pool_within_reach, read_sphere_data
-from eval.core.exits import run_program
 from eval.core.figures import picture, png
 from eval.core.output import make_writable, whole_file
 from eval.core.statistics import mean
 from eval.core.tablefile import read_table
+from eval.core.terminal.exits import run_program
 from eval.studies.descriptors.curve_plots import curves_chart
 from eval.tables.rows import records
 from eval.training.training_run import data_digest

@@ -19,8 +19,8 @@ import numpy as np
 import pandas as pd
 import typer
 
-from eval.core.exits import run_program
 from eval.core.output import make_writable
+from eval.core.terminal.exits import run_program
 from eval.studies.reality.plots import draw_measures, draw_novelty, draw_scene
 from eval.studies.reality.scenes import (
     cast_at_origin,

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,13 @@ from cdpipe.core.errors import InputError
 from eval.bench import bench
 from eval.bench.bench import choose, list_contests, list_reasons, make_row, measure, summarise, write_table
 from eval.bench.merge import FailedContest
+from eval.cli.commands.tools import _print_growth, _print_speed
 from eval.cli.main import main
+from eval.core.terminal.printing import LINE
 from sim.studies.bench import BenchSite
 from sim.studies.timing import Contest, SkippedContest
 
+REPORT = Path(__file__).parents[3] / "reports" / "bench"
 KEYS = ["name", "value", "unit", "rival", "rival_value", "ratio", "target", "met", "n", "spread", "reason"]
 FAST = Contest("Mray/s", (0.5, 0.25, 0.4, 0.2, 1.0), 2.0, "a rival", (2.0, 1.0, 4.0), 4.5)
 SLOW = Contest("Mray/s", (1.0,), 2.0, "a rival", (1.0,), 1.7)
@@ -67,17 +71,31 @@ def test_a_target_just_reached_is_met() -> None:
     assert make_row("even", Contest("Mray/s", (1.0,), 3.0, "a rival", (2.0,), 2.0))["met"] is True
 
 
+@pytest.mark.parametrize(("name", "show"), [("bench-3.json", _print_speed), ("growth.json", _print_growth)])
+def test_a_terminal_has_room_for_the_tables(
+    name: str, show: Callable[[dict[str, Any], list[Path]], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = json.loads((REPORT / name).read_text())
+    show(table, [])
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= LINE
+    # no name or number is folded: a row is one line
+    assert sum(len(line.split()) > 3 and line.startswith("  ") for line in lines) >= len(table["rows"])
+    assert any(line.startswith("left out: ") for line in lines)
+
+
 @pytest.mark.usefixtures("three_rows")
 def test_the_table_and_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "new" / "speed.json"
     code, out, err = run(capsys, "--out", str(file))
     assert code == 0  # though a target is missed
     lines = [line.split() for line in out.splitlines()]
-    assert KEYS[:-1] in lines
+    # the unit stands in the cell of the value; the last column, reason, has lines of its own
+    assert [key for key in KEYS[:-1] if key != "unit"] in lines
     assert ["fast", "5", "Mray/s", "a", "rival", "1", "5", "4.5", "met", "5", "4"] in lines
     assert ["slow", "2", "Mray/s", "a", "rival", "2", "1", "1.7", "missed", "1", "0"] in lines
     assert ["alone", "3", "s", "-", "-", "-", "-", "-", "1", "0"] in lines
-    assert out.splitlines()[-1] == f"1 of 2 targets met; missed: slow; {file}"
+    assert out.splitlines()[-2:] == ["1 of 2 targets met; missed: slow", f"written: {file}"]
     assert [line for line in err.splitlines() if line] == ["[0/3] fast", "[1/3] slow", "[2/3] alone"]
     table = json.loads(file.read_text())
     assert list(table) == ["machine", "rows"]
@@ -108,9 +126,10 @@ def test_what_failed_is_a_row_and_the_rows_before_it_stay(
     monkeypatch.setattr(bench, "list_contests", lambda: {"fast": lambda: FAST, "merge": lambda: failed})
     code, out, _ = run(capsys, "--out", str(tmp_path / "speed.json"))
     assert code == 0
-    assert out.splitlines()[-2:] == [
+    assert out.splitlines()[-3:] == [
         "merge: it is 3.0 m off",
-        f"1 of 2 targets met; missed: merge; {tmp_path / 'speed.json'}",
+        "1 of 2 targets met; missed: merge",
+        f"written: {tmp_path / 'speed.json'}",
     ]
     first, last = json.loads((tmp_path / "speed.json").read_text())["rows"]
     assert first["met"] is True

@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from eval.core.exits import input_errors
+from eval.core.terminal.exits import input_errors
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EFBIG, errno.EACCES])

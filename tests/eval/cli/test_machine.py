@@ -15,7 +15,7 @@ import pytest
 from cdpipe.model.config import settings_table
 from eval.cli.commands import tools
 from eval.cli.doctor import Finding
-from eval.core.printing import echo_json
+from eval.core.terminal.printing import echo_json
 from eval.plans.files import plan_names
 from scenarios import scenario_names
 

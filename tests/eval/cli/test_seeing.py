@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from cdpipe.io.answer import read_answer
-from eval.core.progress import Lines
+from eval.core.terminal.progress import Lines
 from scenarios import load_scenario
 from scenarios.schema import Scenario
 

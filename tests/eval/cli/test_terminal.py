@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 
 from cdpipe.core.errors import InputError
-from eval.core.exits import input_errors
-from eval.core.printing import LINE, print_fitted, print_row, print_table, say
-from eval.core.progress import Bars, Lines
+from eval.core.terminal.exits import input_errors
+from eval.core.terminal.printing import LINE, print_fitted, print_row, print_table, say
+from eval.core.terminal.progress import Bars, Lines
 
 Command = Callable[..., tuple[int, str, str]]
 # clears the screen, sets the title, goes up a line, turns the text around, and is markup of rich

@@ -13,7 +13,7 @@ import pytest
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.io.known_merge import read_alignment, read_known_merge, write_alignment
 from cdpipe.model.alignment import PathAlignment
-from eval.core.progress import Silent
+from eval.core.terminal.progress import Silent
 from eval.leaderboard.evaluation import evaluation_folder, read_call, read_evaluation
 from eval.leaderboard.given_merge import write_merge
 from eval.leaderboard.submission import pack_submission

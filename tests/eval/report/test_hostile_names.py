@@ -14,7 +14,7 @@ import pytest
 
 from eval.core.charts import Axis, Drawing, Heat, Panel, Series
 from eval.core.figures import picture, png
-from eval.report.comparison import compare_sides, write_comparison
+from eval.report.comparing.page import compare_sides, write_comparison
 from eval.report.latex import to_latex
 from eval.report.page import write_page
 from eval.report.tables import Cell, Table

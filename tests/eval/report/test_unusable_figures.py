@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from cdpipe.core.errors import InputError
-from eval.report.comparison import compare_sides, write_comparison
+from eval.report.comparing.page import compare_sides, write_comparison
 from eval.report.page import write_page
 from eval.running.results.run_data import plan_name, read_run, stored_table
 from eval.running.results.sides import read_side

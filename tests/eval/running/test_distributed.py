@@ -25,9 +25,10 @@ from pydantic import TypeAdapter
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import path_part
-from eval.core import cluster, progress
+from eval.core import cluster
 from eval.core.cluster import Where
-from eval.core.progress import Lines
+from eval.core.terminal import progress
+from eval.core.terminal.progress import Lines
 from eval.plans.cells import expand_cells
 from eval.plans.plan import Plan, load_plan
 from eval.running import pair_run, runner

@@ -15,7 +15,7 @@ from cdpipe.methods.registry import Method
 from eval.cli.commands.tools import check_file
 from eval.core import cluster
 from eval.core.cluster import Where, exposure, require_reachable
-from eval.core.progress import Lines, Silent
+from eval.core.terminal.progress import Lines, Silent
 from eval.plans.plan import Plan, load_plan
 from eval.running import runner
 from eval.running.pair_run import Tools

@@ -19,8 +19,8 @@ from eval.scoring import surface_windows
 from eval.scoring.answer_check import check_answer
 from eval.scoring.scoring import CaseScore
 from eval.scoring.surface_places import find_surface_places
-from eval.tables.surface_limits import detection_limits
-from eval.tables.surface_table import MEANS, surface_tables
+from eval.tables.surface.limits import detection_limits
+from eval.tables.surface.table import MEANS, surface_tables
 from eval.truth.ground_truth import GroundTruth
 from tests.eval.scoring.surface_worlds import (
     drawn_patches,

@@ -15,7 +15,7 @@ import torch
 from cdpipe.descriptors.sphere_network import load_sphere_network
 from cdpipe.descriptors.weights_file import digest
 from cdpipe.io.answer import read_answer
-from eval.core.progress import Silent
+from eval.core.terminal.progress import Silent
 from eval.training.dataset import Recipe
 from eval.training.dataset_run import Where, make_dataset
 from scenarios.library import load_scenario

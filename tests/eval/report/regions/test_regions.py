@@ -16,7 +16,7 @@ from eval.report.regions.regions import draw_regions
 from eval.report.summary import draw_summary
 from eval.running.results.run_data import read_run
 from eval.running.runfolder import write_json
-from eval.tables.region_table import FILES, region_tables
+from eval.tables.regions.table import FILES, region_tables
 
 TARGETS = Targets(
     method="tunnelcd",

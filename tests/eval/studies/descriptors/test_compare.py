@@ -16,7 +16,7 @@ from cdpipe.mapping.mapping import build_map
 from cdpipe.model.config import load_config
 from cdpipe.model.types import MappedSession, MergedMaps
 from cdpipe.query.query import find_regions
-from eval.core.progress import Silent
+from eval.core.terminal.progress import Silent
 from eval.running.stages.pair_stages import kept_bytes
 from eval.scoring.region_metrics import label_keyframes
 from eval.studies.descriptors import compare as command

@@ -12,7 +12,7 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.descriptors.sphere_network import SphereSize
 from cdpipe.training.data import TunnelShard
-from eval.core.progress import Silent
+from eval.core.terminal.progress import Silent
 from eval.studies.descriptors import curves as descriptor_curves
 from eval.studies.descriptors.curve_plots import curves_chart, varying
 from eval.studies.descriptors.curves import BITS, Point, main, points, select_share

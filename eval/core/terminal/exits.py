@@ -12,7 +12,7 @@ import typer
 
 from cdpipe.core.errors import TunnelcdError
 from cdpipe.core.names import visible
-from eval.core.interrupts import interruptible
+from eval.core.terminal.interrupts import interruptible
 
 # A full disk, a read-only one, a file too large for it, a folder or file of another user.
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EACCES, errno.EPERM)

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from eval.report.comparing import BETTER, COLUMNS
-from eval.report.comparison import COLOURS, compare_sides, detail_tables, matrix_table, overview, sentences
+from eval.report.comparing.differences import BETTER, COLUMNS
+from eval.report.comparing.page import COLOURS, compare_sides, detail_tables, matrix_table, overview, sentences
 from eval.running.results.sides import Side, read_side
 from eval.scoring.scoring import METRICS_VERSION
 

@@ -9,9 +9,9 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.core.ranking import auroc
 from eval.core.statistics import interval_of
-from eval.tables import region_curves
 from eval.tables.groups import clustered_interval, recall_by_size
-from eval.tables.region_curves import (
+from eval.tables.regions import curves
+from eval.tables.regions.curves import (
     RankedPairs,
     found_at,
     free_response,
@@ -240,7 +240,7 @@ def test_the_interval_of_a_share_draws_pairs() -> None:
 def test_candidates_too_bad_for_any_draw_need_not_be_looked_at(rate: float, monkeypatch: pytest.MonkeyPatch) -> None:
     ranked = ranked_pairs(*random_case(0))
     every = resampled_recalls(ranked, rate)
-    monkeypatch.setattr(region_curves, "_FIRST_CANDIDATES", 1)
+    monkeypatch.setattr(curves, "_FIRST_CANDIDATES", 1)
     resampled_recalls.cache_clear()
     np.testing.assert_array_equal(resampled_recalls(ranked, rate), every)
 

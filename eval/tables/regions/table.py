@@ -18,10 +18,10 @@ from cdpipe.core.geometry import Float64Array
 from cdpipe.core.ranking import auroc
 from eval.core.statistics import interval_of, mean, median, wilson_interval
 from eval.plans.targets import Targets
-from eval.tables.budgets import budget_rows
 from eval.tables.conditions import by_condition, told_apart
 from eval.tables.groups import recall_by_size
-from eval.tables.region_curves import (
+from eval.tables.regions.budgets import budget_rows
+from eval.tables.regions.curves import (
     RATES_PER_100M,
     RankedPairs,
     free_response,

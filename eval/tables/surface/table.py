@@ -18,7 +18,7 @@ from eval.scoring.surface_metrics import SURFACE_GROUP
 from eval.scoring.surface_windows import AREAS_M2
 from eval.tables.conditions import by_condition
 from eval.tables.rows import by_domain, by_variant, means_with_intervals, numbers, of_cases, texts, with_domain
-from eval.tables.surface_limits import detection_limits
+from eval.tables.surface.limits import detection_limits
 from eval.tables.targets import judged_targets
 
 FILES = ("surface_table", "surface_targets", "detection_limits")

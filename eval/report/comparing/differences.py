@@ -16,10 +16,10 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from eval.core.statistics import ENOUGH_PAIRS, paired_difference
-from eval.report.compared_columns import COMPARED, POOLED, POOLED_RATE_PER_100M, figures_of, is_time
+from eval.report.comparing.columns import COMPARED, POOLED, POOLED_RATE_PER_100M, figures_of, is_time
 from eval.running.results.run_data import RunData
 from eval.running.results.sides import Side, check_extras, check_versions, matched_variants
-from eval.tables.region_curves import RankedPairs, ranked_pairs, recall_at, recall_difference
+from eval.tables.regions.curves import RankedPairs, ranked_pairs, recall_at, recall_difference
 from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, numbers
 
 BETTER, WORSE, NOISE = "better", "worse", "no difference beyond noise"

@@ -17,8 +17,8 @@ from eval.core.domains import domain_name
 from eval.core.figures import picture_address
 from eval.core.output import make_writable
 from eval.core.statistics import ENOUGH_PAIRS
-from eval.report.compared_columns import COMPARED
-from eval.report.comparing import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, compare
+from eval.report.comparing.columns import COMPARED
+from eval.report.comparing.differences import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, compare
 from eval.report.render import render_page, write_file
 from eval.report.settings.effects import effect_chart, signed
 from eval.report.tables import Cell, Picture, Table

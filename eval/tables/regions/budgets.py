@@ -25,7 +25,7 @@ import pandas as pd
 from cdpipe.core.geometry import Float64Array
 from cdpipe.extract.extract import ASKED_POINTS
 from eval.tables.groups import clustered_interval
-from eval.tables.region_curves import RankedPairs
+from eval.tables.regions.curves import RankedPairs
 from eval.tables.rows import PAIR, numbers
 
 # The budgets at which recall is stated; areas run from no budget to the last one.

@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 
 from eval.plans.targets import Targets
-from eval.tables.surface_limits import EDGES_M, detection_limits, find_threshold, interpolate_limit
-from eval.tables.surface_table import FILES, surface_tables
+from eval.tables.surface.limits import EDGES_M, detection_limits, find_threshold, interpolate_limit
+from eval.tables.surface.table import FILES, surface_tables
 
 NAN = float("nan")
 

@@ -13,7 +13,7 @@ from cdpipe.model.types import DescriptorSet, MappedSession, PointMap
 from eval.core.statistics import wilson_interval
 from eval.plans.targets import Target, Targets
 from eval.running.stages.pair_stages import kept_bytes
-from eval.tables.region_table import FILES, region_overview, region_tables
+from eval.tables.regions.table import FILES, region_overview, region_tables
 
 NAN = float("nan")
 TARGETS = Targets(

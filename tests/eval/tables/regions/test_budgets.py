@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from eval.tables.budgets import BUDGETS, budget_rows, price_changes
-from eval.tables.region_curves import RankedPairs, ranked_pairs
+from eval.tables.regions.budgets import BUDGETS, budget_rows, price_changes
+from eval.tables.regions.curves import RankedPairs, ranked_pairs
 
 NAN = float("nan")
 ROW = {

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from eval.core.interrupts import interruptible, interrupts_held
+from eval.core.terminal.interrupts import interruptible, interrupts_held
 
 LIBRARY = """import signal
 try:

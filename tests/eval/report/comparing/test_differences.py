@@ -9,15 +9,25 @@ import pandas as pd
 import pytest
 
 from cdpipe.core.errors import InputError
-from eval.report.compared_columns import COMPARED, figures_of
-from eval.report.comparing import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, compare, paired_differences, verdict
+from eval.report.comparing.columns import COMPARED, figures_of
+from eval.report.comparing.differences import (
+    BETTER,
+    NOISE,
+    NOT_JUDGED,
+    SAME,
+    TOO_FEW,
+    WORSE,
+    compare,
+    paired_differences,
+    verdict,
+)
 from eval.report.page import write_page
 from eval.report.summary import means_by_method
 from eval.running.results.run_data import read_run
 from eval.running.results.sides import cautions, is_one_machine, only_in, read_side, short_names, why_no_times
 from eval.scoring.scoring import METRICS_VERSION
 from eval.tables.columns import select
-from eval.tables.region_curves import ranked_pairs, recall_at
+from eval.tables.regions.curves import ranked_pairs, recall_at
 
 NAN = float("nan")
 Write = Callable[..., Path]

@@ -1,0 +1,1 @@
+"""What a run says about rock that moved: a row a method, and detection limits."""
