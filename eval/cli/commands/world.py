@@ -100,7 +100,7 @@ def graft(
     deskew: Deskew = True,
     quiet: Quiet = False,
 ) -> None:
-    """Cast props into real recordings and move their rock: DIR/before, DIR/after, and DIR/truth as `simulate` writes it."""
+    """Cast props into real recordings and move rock: DIR/before, DIR/after, and DIR/truth as `simulate` writes it."""
     from eval.graft.adapters import locate_recording
     from eval.graft.making import make_pair
     from eval.graft.telling import tell_pair
