@@ -190,12 +190,13 @@ def _graft_revolutions(
     part, props = graft.parts[number], graft.props[number]
     noise = graft.noises[number] if graft.noises else None
     for recorded in part.revolutions():
-        revolution, surface = recorded, None
+        revolution, truth = recorded, None
         if graft.rock:
-            revolution, surface = move_rock(part, recorded, graft.rock, graft.steps_mm[number], counts.rock)
+            revolution, truth = move_rock(part, recorded, graft.rock, graft.steps_mm[number], counts.rock)
         made = graft_revolution(part, revolution, props, noise, graft.seed)
         counts.add(made)
-        yield revolution, made, _tally(graft, part, made), surface and surface.on_rock(made.instance == 0)
+        surface = None if truth is None else truth.on_rock(made.instance == 0)
+        yield revolution, made, _tally(graft, part, made), surface
 
 
 def _tally(graft: Graft, part: Part, made: Grafted) -> Int16Array:

@@ -59,12 +59,12 @@ class Surroundings:
 
     def part_of(self, rows: Int64Array) -> Int64Array:
         """Return the number (N,) of the part that some returns belong to."""
-        return self._part[rows]
+        return np.asarray(self._part[rows], dtype=np.int64)
 
     def in_ball(self, place: Float64Array, radius_m: float) -> Int64Array:
         """Return the rows (N,) of the returns within some distance of a place (3,)."""
         rows = self.near(place[:2], radius_m)
-        return rows[((self._points[rows] - place) ** 2).sum(axis=1) < radius_m**2]
+        return np.asarray(rows[((self._points[rows] - place) ** 2).sum(axis=1) < radius_m**2])
 
     def nearest(self, place: Float64Array, within_m: float) -> Float64Array | None:
         """Return the return (3,) nearest to a place (3,); None where none is within some distance."""

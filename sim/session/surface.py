@@ -108,8 +108,8 @@ def list_surface_changes(world: World, displacement: Displacement, before: Moved
             continue
         told = measure_faces(wall, faces, before.measure)
         volume_m3 = displacement.volume_m3(patch.number)
-        named = {"id": patch.number, "name": patch.name, "kind": patch.kind, "partner": patch.partner}
-        found.append(SurfaceChangeTruth(**named, volume_m3=volume_m3, **told))
+        named = patch.number, patch.name, patch.kind, patch.partner
+        found.append(SurfaceChangeTruth(*named, volume_m3=volume_m3, **told))
     return tuple(found)
 
 

@@ -26,11 +26,12 @@ class Heights:
 
     def at(self, places: Float64Array) -> Float64Array:
         """Return the height (N,) at places (N, 2)."""
-        return np.asarray(self.spline.ev(*places.T))
+        return np.asarray(self.spline.ev(places[:, 0], places[:, 1]))
 
     def slopes(self, places: Float64Array) -> Float64Array:
         """Return the slopes (N, 2) along x and y at places (N, 2)."""
-        return np.column_stack([self.spline.ev(*places.T, dx=1), self.spline.ev(*places.T, dy=1)])
+        x, y = places[:, 0], places[:, 1]
+        return np.column_stack([self.spline.ev(x, y, dx=1), self.spline.ev(x, y, dy=1)])
 
     def normals(self, places: Float64Array) -> Float64Array:
         """Return the unit normals (N, 3), positive along z, at places (N, 2)."""
@@ -57,7 +58,7 @@ def fit_heights(points: Float64Array, half_m: tuple[float, float]) -> Heights | 
         nodes = _fit_nodes(points[keeps], axes)
         if nodes is None:
             return None
-        surface = Heights(RectBivariateSpline(*axes, nodes))
+        surface = Heights(RectBivariateSpline(axes[0], axes[1], nodes))
         if band_m is not None:
             keeps = np.abs(surface.off_m(points)[0]) < band_m
     return surface
@@ -74,7 +75,7 @@ def _fit_nodes(points: Float64Array, axes: list[Float64Array]) -> Float64Array |
     terms = np.stack([np.ones_like(x), x, y])
 
     def total(values: Float64Array) -> Float64Array:
-        return np.bincount(node, weight * values, minlength=len(grid))
+        return np.asarray(np.bincount(node, weight * values, minlength=len(grid)), np.float64)
 
     moments = np.array([[total(one * other) for other in terms] for one in terms]).transpose(2, 0, 1)
     told = np.array([total(each * points[pairs.col, 2]) for each in terms]).T
@@ -84,14 +85,16 @@ def _fit_nodes(points: Float64Array, axes: list[Float64Array]) -> Float64Array |
     moments[:, [1, 2], [1, 2]] += _STIFF * _RADIUS_M**2 * moments[:, :1, 0]
     heights = np.linalg.solve(moments[is_told], told[is_told][..., None])[:, 0, 0]
     nearest = np.asarray(cKDTree(grid[is_told]).query(grid)[1])
-    return heights[nearest].reshape([len(axis) for axis in axes])
+    return np.asarray(heights[nearest].reshape([len(axis) for axis in axes]))
 
 
 def cells_seen(places: Float64Array, half_m: tuple[float, float], cell_m: float) -> BoolArray:
     """Mark the cells (A, B) of a rectangle of half sizes `half_m` that hold one of some places (N, 2) at least."""
-    shape = [max(1, round(2 * half / cell_m)) for half in half_m]
-    spans = [(-half, half) for half in half_m]
-    return np.histogram2d(*places.T, bins=shape, range=spans)[0] > 0
+    shape = np.array([max(1, round(2 * half / cell_m)) for half in half_m])
+    cell = ((places / np.array(half_m) + 1.0) / 2.0 * shape).astype(np.int64).clip(0, shape - 1)
+    is_seen = np.zeros(tuple(shape.tolist()), dtype=np.bool_)
+    is_seen[cell[:, 0], cell[:, 1]] = True
+    return is_seen
 
 
 def list_corners(half_m: tuple[float, float]) -> Iterator[tuple[float, float]]:

@@ -73,8 +73,8 @@ class _Returns:
 
     def some(self, which: BoolArray | Int64Array) -> _Returns:
         """Return some of them."""
-        each = self.row, self.column, self.origins, self.ways, self.reach_m
-        return _Returns(*(values[which] for values in each))
+        pixels = self.row[which], self.column[which]
+        return _Returns(*pixels, self.origins[which], self.ways[which], self.reach_m[which])
 
 
 def move_rock(
@@ -172,7 +172,7 @@ def _follow(
     starts = rock.points - off - back_m[:, None] * rock.ways
     hits = [caster.faces(starts, rock.ways) for caster in patch.casters]
     met_m, face = (np.stack([hit[part] for hit in hits]) for part in (0, 2))
-    is_hit = (face >= 0).all(axis=0)
+    is_hit: BoolArray = np.asarray((face >= 0).all(axis=0))
     own = int(is_after)
     moves = is_hit & (patch.is_moved[face[own]])
     further_m, moved_m = np.zeros(len(starts)), np.zeros(len(starts))

@@ -126,7 +126,7 @@ def weigh(change: RockChange, places: Float64Array) -> Float64Array:
     """Return the share (N,) of its size by which a change moves rock at places (N, 2) about its middle."""
     half_m = np.array(change.sides_m) / 2
     if change.kind == "shotcrete":
-        return np.clip((half_m - np.abs(places)).min(axis=1) / EDGE_M, 0.0, 1.0)
+        return np.asarray(np.clip((half_m - np.abs(places)).min(axis=1) / EDGE_M, 0.0, 1.0))
     return window(places[:, 0] / half_m[0]) * window(places[:, 1] / half_m[1])
 
 
