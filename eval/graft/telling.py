@@ -24,7 +24,8 @@ def tell_pair(truth: PairTruth) -> list[str]:
     if not graft["props"]:
         return lines if graft.get("rock") else [*lines, "nothing is grafted: a real pair without changes"]
     replaced, grafted, lost = (sum(each[key] for each in graft["returns"]) for key in ("replaced", "grafted", "lost"))
-    lines.append(f"{len(truth.changes)} changes, {observable} observable; {grafted} returns of props, {lost} lost")
+    changes = "1 change" if len(truth.changes) == 1 else f"{len(truth.changes)} changes"
+    lines.append(f"{changes}, {observable} observable; {grafted} returns of props, {lost} lost")
     lines.append(f"{replaced} recorded returns replaced or in a shadow")
     return [*lines, *(_tell_noise(noise) for noise in graft["noise"][: len(graft["recordings"])])]
 
