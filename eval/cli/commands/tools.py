@@ -98,13 +98,10 @@ def _require_one_table(*, growth: bool, profile: bool, surface: bool, quick: boo
 
 
 def _print_speed(table: dict[str, Any], written: list[Path]) -> None:
-    import pandas as pd
-
     from eval.bench.bench import list_reasons, summarise
 
-    rows = pd.DataFrame(table["rows"])
-    value = [_with_unit(*each) for each in zip(rows["value"], rows["unit"], strict=True)]
-    shown = rows.assign(value=value, met=rows["met"].map(MET.get)).drop(columns=["reason", "unit"])
+    rows = _with_units(table["rows"])
+    shown = rows.assign(met=rows["met"].map(MET.get)).drop(columns="reason")
     _print_fitted(f"speed, {_machine(table)}; ratio: times faster than the rival", shown, _SPEED_GIVES_WAY)
     for line in [*list_reasons(table["rows"]), summarise(table["rows"])]:
         echo_wrapped(line, LINE)
@@ -112,13 +109,9 @@ def _print_speed(table: dict[str, Any], written: list[Path]) -> None:
 
 
 def _print_growth(table: dict[str, Any], written: list[Path]) -> None:
-    import pandas as pd
-
     from eval.bench.growth import summarise_growth
 
-    rows = pd.DataFrame(table["rows"])
-    value = [_with_unit(*each) for each in zip(rows["value"], rows["unit"], strict=True)]
-    shown = rows.assign(value=value).drop(columns=["grows", "unit", "n"])
+    shown = _with_units(table["rows"]).drop(columns=["grows", "n"])
     title = f"growth, {_machine(table)}; figure = c * size ** exponent (low, high: 95 %)"
     _print_fitted(title, shown.round(_DECIMALS_OF_EXPONENTS), _GROWTH_GIVES_WAY)
     echo_wrapped(summarise_growth(table), LINE)
@@ -138,8 +131,13 @@ def _print_fitted(title: str, table: pd.DataFrame, gives_way: Sequence[Sequence[
         echo_wrapped(f"left out: {', '.join(left_out)}; --json and --out FILE.json have all", LINE)
 
 
-def _with_unit(value: float | None, unit: str) -> str:
-    return "-" if value is None or math.isnan(value) else f"{value:.3g} {unit}"
+def _with_units(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
+    """Return the rows with the unit in the cell of the value, of three digits."""
+    import pandas as pd
+
+    values = [math.nan if row["value"] is None else float(row["value"]) for row in rows]
+    told = ["-" if math.isnan(value) else f"{value:.3g} {row['unit']}" for value, row in zip(values, rows, strict=True)]
+    return pd.DataFrame(rows).assign(value=told).drop(columns="unit")
 
 
 def _machine(table: dict[str, Any]) -> str:
