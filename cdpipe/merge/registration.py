@@ -107,7 +107,7 @@ class IndexedMap:
         self.path = cKDTree(point_map.odom_T_sensor[:, :3, 3])
         self.local_s = 0.0
         self._coarse_voxel_m, self._places = config.coarse_voxel_m, list[_Place]()
-        self._is_target, self._is_local = is_target, is_local
+        self._is_local = is_local
         is_whole = is_target and not is_local
         self._fine = Surface(self.points) if is_whole else None
         self._coarse = Surface(self.points, config.coarse_voxel_m) if is_whole and has_coarse_target else None

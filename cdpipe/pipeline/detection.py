@@ -26,7 +26,7 @@ from cdpipe.merge.coverage import measure_coverage
 from cdpipe.merge.merge import merge_maps, take_known_merge
 from cdpipe.methods.registry import list_extras, load_source
 from cdpipe.model.config import PipelineConfig, Site, load_config
-from cdpipe.model.report import ChangeRegions, ChangeReport
+from cdpipe.model.report import ChangeRegions, ChangeReport, SurfaceField
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, ScanSource
 from cdpipe.pipeline.hooks import Done, Hooks
 from cdpipe.pipeline.mapping import map_pair, open_with_folder
@@ -86,6 +86,7 @@ def detect(
         report = detect_changes(*mapped.value, config, hooks, merge=merge)
     except MergeFailedError as error:
         raise MergeFailedError(f"{before.name} and {after.name}: {error}", error.evidence, error.seconds) from error
+    _warn_of_no_level(report.surface, config.surface.method)
     coverage = measure_coverage(report, before.odom_T_sensor, after.odom_T_sensor)
     return replace(report, seconds={**report.seconds, **mapped.seconds}, coverage=coverage)
 
@@ -218,6 +219,17 @@ def _warn_of_few_views(mapped: Sequence[MappedSession], config: PipelineConfig) 
         text = (
             f"{n_views} keyframes in the shorter session, {asked}: no object is seen through often enough to be found: "
             "record a path, or lower it (--set extract.min_views=0.5)"
+        )
+        warnings.warn(text, InputWarning, stacklevel=3)
+
+
+def _warn_of_no_level(field: SurfaceField | None, method: str) -> None:
+    """Warn where displacement was measured and nothing tells how sure it is: then no region of rock is found."""
+    if field is not None and np.isfinite(field.displacement_m).any() and not np.isfinite(field.level_m).any():
+        text = (
+            f"surface.method = {method}: no displacement has a level of detection, so no rock is "
+            "reported to have moved: scans of different metres of path tell the error: record a path of 2 m and more "
+            "past the rock, or ask for --set surface.method=m3c2-ep"
         )
         warnings.warn(text, InputWarning, stacklevel=3)
 

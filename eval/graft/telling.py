@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from sim.session.truth import PairTruth
+from typing import Any
+
+from sim.session.truth import PairTruth, SurfaceChangeTruth
 
 _SPLITS = {
     "passes": "two passes of one way",
@@ -17,13 +19,21 @@ def tell_pair(truth: PairTruth) -> list[str]:
     """Return lines about a grafted pair: where it is from, what is in it, and how noisy the recording is."""
     graft = truth.graft or {}
     lines = [f"sessions: {_SPLITS[graft['split']]}, {_MERGES[graft['merge_from']]}"]
+    lines += [_tell_rock(rock, each) for rock, each in zip(truth.surface_changes, graft.get("rock", ()), strict=True)]
     observable = sum(change.is_observable for change in truth.changes)
     if not graft["props"]:
-        return [*lines, "nothing is grafted: a real pair without changes"]
+        return lines if graft.get("rock") else [*lines, "nothing is grafted: a real pair without changes"]
     replaced, grafted, lost = (sum(each[key] for each in graft["returns"]) for key in ("replaced", "grafted", "lost"))
     lines.append(f"{len(truth.changes)} changes, {observable} observable; {grafted} returns of props, {lost} lost")
     lines.append(f"{replaced} recorded returns replaced or in a shadow")
     return [*lines, *(_tell_noise(noise) for noise in graft["noise"][: len(graft["recordings"])])]
+
+
+def _tell_rock(rock: SurfaceChangeTruth, told: dict[str, Any]) -> str:
+    """Return what a rock change amounts to, and how many returns of the after session it moved."""
+    sizes = f"{rock.area_m2:.1f} m2, {1000 * rock.largest_m:+.0f} mm at most, {rock.volume_m3:+.3f} m3"
+    left = f"{told['left'][1]} too flat, hidden or off the rock and left" if told["left"][1] else "none left"
+    return f"{rock.kind} {rock.name!r}: {sizes}; {told['moved'][1]} returns moved, {left}"
 
 
 def _tell_noise(noise: dict[str, list[float]]) -> str:

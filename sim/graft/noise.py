@@ -11,7 +11,8 @@ Lost is a beam without a return between four neighbours of its row whose ranges 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -90,15 +91,29 @@ def measure_noise(parts: Sequence[Part]) -> RangeNoise:
     """
     residuals, gaps, bright, steps = [], [], [], []
     for part in parts:
-        n_scans = len(part.scans)
-        chosen = np.unique(np.linspace(0, n_scans - 1, min(_SCANS, n_scans)).astype(np.int64))
-        for revolution in part.revolutions(chosen):
+        for revolution in _sample(part):
             points, is_return = measured_points(part, revolution)
             residuals.append(plane_residuals(points[is_return]))
             gaps.append(_find_gaps(revolution, part.source.sensor.height))
             bright.append(_list_bright(revolution, part.source.sensor.height))
-            steps.append(int(np.gcd.reduce(revolution.range_mm[revolution.range_mm > 0], initial=0)))
+            steps.append(_step_mm(revolution))
     return _tabulate(np.concatenate(residuals), np.concatenate(gaps), np.concatenate(bright), steps, parts)
+
+
+def measure_step_mm(parts: Sequence[Part]) -> int:
+    """Return the step of the ranges of some parts of a recording, from twelve revolutions of each."""
+    return max(1, math.gcd(*(_step_mm(revolution) for part in parts for revolution in _sample(part))))
+
+
+def _sample(part: Part) -> Iterator[RecordedRevolution]:
+    """Yield twelve revolutions of a part, or all of fewer, spread evenly."""
+    n_scans = len(part.scans)
+    return part.revolutions(np.unique(np.linspace(0, n_scans - 1, min(_SCANS, n_scans)).astype(np.int64)))
+
+
+def _step_mm(revolution: RecordedRevolution) -> int:
+    """Return the greatest common divisor of the ranges of a revolution, 0 where it has no return."""
+    return int(np.gcd.reduce(revolution.range_mm[revolution.range_mm > 0], initial=0))
 
 
 def _tabulate(
@@ -123,7 +138,7 @@ def _tabulate(
     intensity = intensity[_nearest(n_bright > 0)]
     if n_gaps.any():
         lost = lost[_nearest(n_gaps >= min(_LEAST, int(n_gaps.max())))]
-    return RangeNoise(quantiles, n_residuals, lost, n_gaps, intensity, max(1, int(np.gcd.reduce(steps))))
+    return RangeNoise(quantiles, n_residuals, lost, n_gaps, intensity, max(1, math.gcd(*steps)))
 
 
 def _nearest(is_filled: npt.NDArray[np.bool_]) -> Int64Array:

@@ -15,8 +15,9 @@ from scenarios.grafted import GraftScenario
 from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 from sim.graft.casting import Props
-from sim.graft.noise import RangeNoise, measure_noise
+from sim.graft.noise import RangeNoise, measure_noise, measure_step_mm
 from sim.graft.part import Part
+from sim.graft.rock import Patch, find_rock
 from sim.graft.splitting import split_scans
 from sim.graft.standing import stand_props
 from sim.graft.surroundings import Surroundings
@@ -73,6 +74,8 @@ class Graft:
         noises: What the recording of each shows of its noise; empty where nothing is grafted.
         standing: Every prop at each of its places.
         tallies: The changes.
+        rock: The rock that moves between them.
+        steps_mm: Step of the ranges of each session, where rock moves.
     """
 
     scenario: GraftScenario
@@ -84,6 +87,8 @@ class Graft:
     noises: tuple[RangeNoise, ...]
     standing: tuple[Standing, ...]
     tallies: tuple[Tally, ...]
+    rock: tuple[Patch, ...] = ()
+    steps_mm: tuple[int, ...] = ()
 
     def describe(self) -> dict[str, Any]:
         """Return what the truth tells beside the changes."""
@@ -106,11 +111,11 @@ class Graft:
 
 
 def plan_graft(scenario: GraftScenario, seed: int, recorded: Recorded, report: Progress) -> Graft:
-    """Split the recording, measure its noise and stand the props.
+    """Split the recording, measure its noise, stand the props and find the rock that moves.
 
     Raises:
         InputError: The recording cannot be split or read, or is too short to tell its noise.
-        ScenarioError: A prop finds no place.
+        ScenarioError: A prop or a rock change finds no place.
     """
     report("measure", 0, 2)
     parts, split = _take_parts(scenario, recorded)
@@ -118,12 +123,14 @@ def plan_graft(scenario: GraftScenario, seed: int, recorded: Recorded, report: P
     measured = [measure_noise(group) for group in groups] if scenario.props else []
     noises = [measured[min(number, len(measured) - 1)] for number in range(2)] if measured else []
     report("measure", 1, 2)
-    around = Surroundings(parts, scenario.recording.reach_m) if scenario.props else None
+    around = Surroundings(parts, scenario.recording.reach_m) if scenario.props or scenario.surface else None
     standing = tuple(stand_props(scenario, around, seed)) if around is not None else ()
+    rock = find_rock(scenario, around, standing, seed) if around is not None else ()
     compared = Compared(standing, *(_surfaces(scenario, standing, name) for name in SESSIONS))
     report("measure", 2, 2)
     props = tuple(_props(surfaces) for surfaces in (compared.before, compared.after))
-    told = tuple(noises), standing, tuple(list_changes(scenario, compared))
+    steps_mm = tuple(measure_step_mm(groups[min(number, len(groups) - 1)]) for number in range(2)) if rock else ()
+    told = tuple(noises), standing, tuple(list_changes(scenario, compared)), rock, steps_mm
     return Graft(scenario, seed, recorded, split, parts, (props[0], props[1]), *told)
 
 

@@ -35,13 +35,17 @@ class Surroundings:
 
     Attributes:
         path: (P, 3) places of the sensor in all parts.
+        paths: The same for each part.
+        n_points: Number of returns.
     """
 
     def __init__(self, parts: Sequence[Part], reach_m: float) -> None:
         clouds = [_gather(part, reach_m) for part in parts]
-        self.path = np.concatenate([part.world_T_sensor[:, :3, 3] for part in parts])
+        self.paths = tuple(part.world_T_sensor[:, :3, 3] for part in parts)
+        self.path = np.concatenate(self.paths)
         self._n_parts = len(clouds)
         self._points = np.concatenate(clouds)
+        self.n_points = len(self._points)
         self._part = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
         self._tree = cKDTree(self._points[:, :2])
 
@@ -52,6 +56,22 @@ class Surroundings:
     def points(self, rows: Int64Array) -> Float64Array:
         """Return some returns (N, 3)."""
         return self._points[rows]
+
+    def part_of(self, rows: Int64Array) -> Int64Array:
+        """Return the number (N,) of the part that some returns belong to."""
+        return np.asarray(self._part[rows], dtype=np.int64)
+
+    def in_ball(self, place: Float64Array, radius_m: float) -> Int64Array:
+        """Return the rows (N,) of the returns within some distance of a place (3,)."""
+        rows = self.near(place[:2], radius_m)
+        return np.asarray(rows[((self._points[rows] - place) ** 2).sum(axis=1) < radius_m**2])
+
+    def nearest(self, place: Float64Array, within_m: float) -> Float64Array | None:
+        """Return the return (3,) nearest to a place (3,); None where none is within some distance."""
+        rows = self.in_ball(place, within_m)
+        if not len(rows):
+            return None
+        return np.asarray(self._points[rows[((self._points[rows] - place) ** 2).sum(axis=1).argmin()]])
 
     def find_floor(self, place: Float64Array, radius_m: float, sensor_z_m: float) -> Floor | None:
         """Fit a plane to the lowest returns around a place (2,); None where they are few, rough, steep or one-sided.

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
@@ -103,31 +106,35 @@ def list_surface_changes(world: World, displacement: Displacement, before: Moved
         faces = np.flatnonzero(displacement.label == patch.number)
         if not len(faces):  # crept by less than 1 mm
             continue
-        pieces, owners = cut_triangles(wall.vertices[wall.faces[faces]], _PIECE_M)
-        moved_m = before.measure(pieces.mean(axis=1), faces[owners])
-        area_m2 = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1) / 2
-        corners = np.unique(wall.faces[faces])
-        corner_face = _face_of(wall, faces, corners)
-        corner_m = before.measure(wall.vertices[corners], corner_face)
-        is_moved = np.abs(moved_m) > MOVED_M
-        total_m2 = float(area_m2[is_moved].sum())
-        every_m = np.concatenate([moved_m[np.isfinite(moved_m)], corner_m[np.isfinite(corner_m)], [0.0]])
-        mean_m = float((moved_m * area_m2)[is_moved].sum() / total_m2) if total_m2 else 0.0
-        centre = (pieces.mean(axis=1) * area_m2[:, None]).sum(axis=0) / area_m2.sum()
-        found.append(
-            SurfaceChangeTruth(
-                id=patch.number,
-                name=patch.name,
-                kind=patch.kind,
-                partner=patch.partner,
-                area_m2=total_m2,
-                volume_m3=displacement.volume_m3(patch.number),
-                largest_m=float(every_m[np.argmax(np.abs(every_m))]),
-                mean_m=mean_m,
-                centre_world=centre.tolist(),
-            )
-        )
+        told = measure_faces(wall, faces, before.measure)
+        volume_m3 = displacement.volume_m3(patch.number)
+        named = patch.number, patch.name, patch.kind, patch.partner
+        found.append(SurfaceChangeTruth(*named, volume_m3=volume_m3, **told))
     return tuple(found)
+
+
+def measure_faces(
+    wall: Mesh, faces: Int64Array, measure: Callable[[Float64Array, Int64Array], Float64Array]
+) -> dict[str, Any]:
+    """Return what a change of some faces (K,) amounts to: `area_m2`, `largest_m`, `mean_m` and `centre_world`.
+
+    Args:
+        wall: The before surface.
+        faces: Those that belong to the change.
+        measure: Gives the displacement (N,) at places (N, 3) on faces (N,) of this surface.
+    """
+    pieces, owners = cut_triangles(wall.vertices[wall.faces[faces]], _PIECE_M)
+    moved_m = measure(pieces.mean(axis=1), faces[owners])
+    area_m2 = np.linalg.norm(np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0]), axis=1) / 2
+    corners = np.unique(wall.faces[faces])
+    corner_m = measure(wall.vertices[corners], _face_of(wall, faces, corners))
+    is_moved = np.abs(moved_m) > MOVED_M
+    total_m2 = float(area_m2[is_moved].sum())
+    every_m = np.concatenate([moved_m[np.isfinite(moved_m)], corner_m[np.isfinite(corner_m)], [0.0]])
+    mean_m = float((moved_m * area_m2)[is_moved].sum() / total_m2) if total_m2 else 0.0
+    centre = (pieces.mean(axis=1) * area_m2[:, None]).sum(axis=0) / area_m2.sum()
+    largest_m = float(every_m[np.argmax(np.abs(every_m))])
+    return {"area_m2": total_m2, "largest_m": largest_m, "mean_m": mean_m, "centre_world": centre.tolist()}
 
 
 def _near_box(mesh: Mesh, corners: Float64Array, within_m: float) -> BoolArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array, Int64Array
+from sim.graft.rebuild import RockOutline
 from sim.scene import WALL_GEOM, World
 from sim.session.surface import MovedRock
 from sim.view.returns import Rgb
@@ -50,6 +51,11 @@ def displacement_class(moved_m: Float64Array) -> Int64Array:
     """Return the class of each of (N,) displacements, metres, positive into the void: an index of `ROCK_RGB`."""
     rank = np.searchsorted(STEPS_M, np.abs(moved_m), side="right")
     return np.asarray(len(STEPS_M) + np.where(moved_m < 0, -rank, rank), dtype=np.int64)
+
+
+def outline_rgb(rock: RockOutline) -> Rgb:
+    """Return the colour of a rock change of a grafted pair: that of its largest displacement."""
+    return ROCK_RGB[int(displacement_class(np.array([rock.told.largest_m]))[0])]
 
 
 def face_tints(world: World) -> Float64Array:

@@ -19,17 +19,17 @@ from cdpipe.io.session import is_session, read_session
 from scenarios.schema import Scenario
 from sim.drive.trajectory import Trajectory
 from sim.geometry.mesh import Mesh, cylinder_mesh, drop_unused_vertices, join_meshes, move_mesh
-from sim.graft.rebuild import rebuild_props
+from sim.graft.rebuild import outline_rock, rebuild_props
 from sim.placement.placing import Standing, standing_box
 from sim.placement.puddles import Pool
 from sim.props.shapes import solid_mesh
 from sim.scene import WALL_GEOM, World, build_world
-from sim.session.truth import SESSIONS, SessionName, read_pair_truth, read_true_poses
+from sim.session.truth import SESSIONS, PairTruth, SessionName, read_pair_truth, read_true_poses
 from sim.story.state import is_story
 from sim.view.building import PlacedMover, build_pair, list_pools, place_movers, plan_drives
 from sim.view.picture import material_colour
 from sim.view.returns import CHANGE_RGB, SESSION_RGB, Cloud, Revolutions, Rgb, points_cloud, session_cloud
-from sim.view.rock import ROCK_RGB, class_name, displacement_classes
+from sim.view.rock import ROCK_RGB, class_name, displacement_classes, outline_rgb
 
 _N_BANDS = 10
 _WATER_RGB: Rgb = (70, 120, 170)
@@ -150,7 +150,7 @@ def view_pair(pair: Path) -> View:
         for session in SESSIONS
     ]
     if truth.graft is not None:
-        view = _props_view(title, rebuild_props(truth), lines, clouds)
+        view = _grafted_view(title, truth, lines, clouds)
         return replace(view, play=_player(poses.items(), (), {}, revolutions))
     built = build_pair(pair, truth)
     world, drives, movers = built.world, built.drives, built.movers
@@ -305,12 +305,15 @@ def _world_view(
     return View(title, wall_bands(wall, floor_points), surfaces, all_lines, clouds, labels, eye, target, notes)
 
 
-def _props_view(title: str, standing: Sequence[Standing], lines: Sequence[Line], clouds: tuple[Cloud, ...]) -> View:
-    """Return the view of a grafted pair, whose walls are known by their returns alone."""
+def _grafted_view(title: str, truth: PairTruth, lines: Sequence[Line], clouds: tuple[Cloud, ...]) -> View:
+    """Return the view of a grafted pair, whose walls are known by their returns alone, with outlines of moved rock."""
+    standing, rock = rebuild_props(truth), outline_rock(truth)
     surfaces = tuple(surface for item in standing for surface in _prop_surfaces(item))
     target = lines[0].points[len(lines[0].points) // 2]
-    labels = tuple(_label(item) for item in standing)
-    return View(title, (), surfaces, tuple(lines), clouds, labels, target + np.array([-6.0, -6.0, 8.0]), target)
+    outlines = [Line(f"rock/{each.told.name}", each.ring, outline_rgb(each)) for each in rock]
+    labels = [Label(f"labels/rock {each.told.name}", each.ring[:4].mean(axis=0), each.text) for each in rock]
+    eye = target + np.array([-6.0, -6.0, 8.0])
+    return View(title, (), surfaces, (*lines, *outlines), clouds, (*map(_label, standing), *labels), eye, target)
 
 
 def _rock_surfaces(world: World) -> list[Surface]:

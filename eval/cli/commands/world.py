@@ -63,7 +63,7 @@ def graft(
         str,
         typer.Option(
             "--objects",
-            help="props: a scenario's name or .yaml file; none: a real pair without changes",
+            help="props, rock that moves: a scenario's name or .yaml file; none: a real pair without changes",
             autocompletion=complete_scenario,
         ),
     ] = "none",
@@ -100,7 +100,7 @@ def graft(
     deskew: Deskew = True,
     quiet: Quiet = False,
 ) -> None:
-    """Cast props into the scans of real recordings: DIR/before, DIR/after, and DIR/truth as `simulate` writes it."""
+    """Cast props into real recordings and move rock: DIR/before, DIR/after, and DIR/truth as `simulate` writes it."""
     from eval.graft.adapters import locate_recording
     from eval.graft.making import make_pair
     from eval.graft.telling import tell_pair
@@ -118,7 +118,7 @@ def graft(
     with shown_warnings(), shown_progress(quiet) as progress:
         make_pair(drawn, seed, out, progress.stage)
     if not quiet:
-        echo(f"{out}: before, after, truth; props of {objects}, seed {seed}", *tell_pair(read_pair_truth(out)))
+        echo(f"{out}: before, after, truth; {objects} grafted, seed {seed}", *tell_pair(read_pair_truth(out)))
 
 
 def survey(

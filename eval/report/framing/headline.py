@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -21,6 +22,7 @@ from eval.tables.merge_table import ALL_FAMILIES
 from eval.tables.rows import ALL_DOMAINS, is_told_the_truth, numbers, records
 
 _MOST_NAMES = 3
+_FIRST_SETTING = re.compile(r"(?P<preset>[^\[]+)\[(?P<key>[^=,\]]+)=(?P<value>[^,\]]+)[,\]]")
 _TOO_LITTLE = "The run holds too little to compare two methods."
 _SUBJECT = "change detection between two LiDAR sessions of a tunnel"
 _RIGHT = Column("right", "share of the pairs merged as their kind asks", "high", share)
@@ -87,16 +89,33 @@ def _shortened(name: str) -> str:
     return f"{first}, \u2026]" if comma and "[" in first else name
 
 
+def name_by_setting(variants: Iterable[str]) -> tuple[str, dict[str, str]]:
+    """Return the first setting of some variants and its value in each, if they are one preset and the values differ.
+
+    "" and nothing otherwise. `tunnelcd[surface.method=planes]` and `tunnelcd[surface.method=c2c,surface.reach_m=2]` are
+    `surface.method`, `planes` and `c2c`.
+    """
+    names = list(dict.fromkeys(variants))
+    found = [match for match in map(_FIRST_SETTING.match, names) if match]
+    values = [match["value"] for match in found]
+    is_one_setting = len({(match["preset"], match["key"]) for match in found}) == 1
+    if len(found) < len(names) or not is_one_setting or len(set(values)) < len(values):
+        return "", {}
+    return found[0]["key"], dict(zip(names, values, strict=True))
+
+
 def _told(table: pd.DataFrame, column: Column) -> str:
     """Return who leads in every domain of a table, by one of its columns."""
+    names = table["variant"].astype(str)
+    setting, values = name_by_setting(names[~names.map(is_told_the_truth)])
     parts = []
-    for domain, own in table.groupby("domain", sort=False):
+    for domain, own in table.assign(variant=names.replace(values)).groupby("domain", sort=False):
         if domain == ALL_DOMAINS and table["domain"].nunique() > 1:
             continue
-        leaders = name_leaders(zip(own["variant"].astype(str), numbers(own, column.key), strict=True), column)
+        leaders = name_leaders(zip(own["variant"], numbers(own, column.key), strict=True), column)
         parts += [f"{domain_name(str(domain))}: {leaders}"] if leaders else []
-    extreme = "Highest" if column.better == "high" else "Lowest"
-    return f"{extreme} {column.heading}, {'; '.join(parts)}." if parts else ""
+    extreme, by = "Highest" if column.better == "high" else "Lowest", f" by {setting}" if setting else ""
+    return f"{extreme} {column.heading}{by}, {'; '.join(parts)}." if parts else ""
 
 
 def _of_pairs(data: RunData) -> str:

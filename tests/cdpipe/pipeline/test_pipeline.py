@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import meshio
@@ -7,14 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.errors import MergeFailedError
+from cdpipe.core.errors import InputWarning, MergeFailedError
 from cdpipe.core.geometry import Float64Array, stream, yaw_pose
 from cdpipe.io.answer import read_answer, write_answer
 from cdpipe.io.readers import open_session
 from cdpipe.model.config import ClusterConfig, ExtractConfig, MergeConfig, OutlierConfig, PipelineConfig, QueryConfig
-from cdpipe.model.report import ChangeReport
+from cdpipe.model.report import ChangeReport, SurfaceField
 from cdpipe.model.types import MappedSession
 from cdpipe.pipeline import detect_changes, map_session
+from cdpipe.pipeline.detection import _warn_of_no_level
 
 CONFIG = PipelineConfig(
     merge=MergeConfig(voxel_m=0.25),
@@ -67,6 +69,20 @@ def test_the_report_survives_the_disk(report: ChangeReport, tmp_path: Path) -> N
     assert stored is not None
     assert [item.kind for item in stored.objects] == [item.kind for item in report.objects]
     np.testing.assert_array_equal(stored.figures["v_sphere_m3"], report.figures["v_sphere_m3"])
+
+
+def test_displacement_without_a_level_is_warned_of() -> None:
+    def field(*levels_m: float) -> SurfaceField:
+        n = len(levels_m)
+        none, region = np.zeros((n, 3)), np.full(n, -1, np.int32)
+        return SurfaceField(none, none, np.full(n, 0.01), np.array(levels_m, dtype=np.float64), region)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for surface in (None, field(), field(np.nan, 0.01)):
+            _warn_of_no_level(surface, "planes")
+    with pytest.warns(InputWarning, match="no displacement has a level of detection.*m3c2-ep"):
+        _warn_of_no_level(field(np.nan, np.nan), "planes")
 
 
 def test_sessions_without_overlap_fail_with_evidence(tunnel_before: MappedSession, other_tunnel: MappedSession) -> None:

@@ -14,7 +14,7 @@ from cdpipe.core.errors import MergeFailedError
 from cdpipe.io.session import read_session
 from cdpipe.pipeline import detect
 from eval.scoring import score
-from sim.session.truth import SESSIONS, read_chunk_labels, read_pair_truth
+from sim.session.truth import SESSIONS, read_chunk_labels, read_chunk_surface, read_pair_truth
 
 pytestmark = pytest.mark.skipif(
     "TUNNELCD_REAL_DATA" not in os.environ, reason="real recordings: TUNNELCD_REAL_DATA is not set"
@@ -103,3 +103,34 @@ def test_two_scans_with_a_published_merge(command: Callable[..., Any], tmp_path:
     found = score(report, null)
     assert found["merge_error_m"] < 0.02
     assert found["n_false_regions"] == 0
+
+
+def test_rock_moves_in_two_scans_with_a_published_merge(command: Callable[..., Any], tmp_path: Path) -> None:
+    for name in ("target", "source"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "0.ply").symlink_to(ROOT / f"registration_pair/{name}.ply")
+        (tmp_path / name / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
+    (tmp_path / "rock.yaml").write_text("surface:\n  - {name: wall, kind: convergence, depth_m: 0.04, area_m2: 4}\n")
+    merge = ROOT / "registration_pair/T_target_source.txt"
+    for name, objects in (("moved", tmp_path / "rock.yaml"), ("null", "none")):
+        argv = tmp_path / "target", tmp_path / "source", "--before-T-after", merge, "--objects", objects
+        assert command("graft", *argv, "--seed", 10001, "--out", tmp_path / name, "-q")[0] == 0
+    truth = read_pair_truth(tmp_path / "moved")
+    assert truth.graft is not None
+    assert truth.surface_changes[0].largest_m == pytest.approx(0.04, abs=1e-4)
+    ranges_mm = {}
+    for name in SESSIONS:
+        now, was = (read_session(tmp_path / pair / name).chunk(0) for pair in ("moved", "null"))
+        surface = read_chunk_surface(tmp_path / "moved" / name, 0)
+        assert surface is not None
+        moved_m, change = surface
+        is_same = (moved_m == 0) | ~np.isfinite(moved_m) if name == "after" else np.ones(moved_m.shape, dtype=bool)
+        np.testing.assert_array_equal(now.range_mm[is_same], was.range_mm[is_same])
+        for key in ("reflectivity", "signal", "column_poses", "column_stamps_ns"):
+            np.testing.assert_array_equal(getattr(now, key), getattr(was, key))
+        assert (change > 0).sum() > 1000
+        ranges_mm[name] = (was.range_mm.astype(float) - now.range_mm)[change > 0], moved_m[change > 0]
+    nearer_mm, moved_m = ranges_mm["after"]
+    # a ray that meets the wall at an angle goes farther than the wall: 80 degrees at the most
+    assert (nearer_mm >= 1000 * moved_m - 1).mean() > 0.98
+    assert (nearer_mm <= 1000 * moved_m / np.cos(np.deg2rad(80)) + 1).mean() > 0.98

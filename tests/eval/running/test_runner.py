@@ -1,9 +1,8 @@
-import hashlib
 import json
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import count, groupby
 from pathlib import Path
@@ -23,8 +22,6 @@ from cdpipe.io.readers import open_session
 from cdpipe.mapping.mapping import build_map
 from cdpipe.model.config import MapConfig
 from cdpipe.pipeline import Done
-from cdpipe.sensor.ouster import load_profile
-from eval.core.output import remove
 from eval.core.terminal.progress import Silent
 from eval.plans.cells import expand_cells
 from eval.plans.changes import change_plan
@@ -33,85 +30,20 @@ from eval.running import pair_run
 from eval.running.pair_run import Tools
 from eval.running.rescoring import rescore
 from eval.running.runfolder import RunFolder, open_run_folder, start_run_folder, write_json, write_tables
-from eval.running.runner import RunOutcome, _provenance, run_plan
+from eval.running.runner import RunOutcome, _provenance
 from eval.running.stages.pair_stages import time_parts
 from eval.truth.adapters import pipeline_input
-from scenarios.library import load_scenario
-from scenarios.references import file_digests
-from scenarios.schema import Scenario
-from sim.session.truth import read_pair_truth, write_pair_truth
-
-ONE_BOX, UNCHANGED = "smoke/one_box", "smoke/unchanged"
-VARIANTS = ["paper", "tunnelcd", "voxel-diff", "random-regions"]
-# a quarter of the returns: these tests are about what is run, not about how well
-SMALL = ("sensor.mode=512x10", "platform.scan_spacing_m=1.0")
-
-
-def load_small(name: str, seed: int, settings: Iterable[str] = ()) -> Scenario:
-    return load_scenario(name, seed, [*SMALL, *settings])
-
-
-@pytest.fixture(scope="module")
-def pairs(simulated_once: Callable[[Scenario, int], Path]) -> dict[str, Path]:
-    """Both smoke scenarios, thinned out and simulated once; every test works on copies."""
-    return {name: simulated_once(load_small(name, 20000), 20000) for name in (ONE_BOX, UNCHANGED)}
-
-
-class Runner:
-    """Runs plans on copies of the pairs instead of simulating them.
-
-    Attributes:
-        asked: The scenarios that were to be simulated, in order.
-        tools: What `run` gives to the run; other tools copy pairs too if they are made from these.
-    """
-
-    def __init__(self, pairs: dict[str, Path]) -> None:
-        self._pairs = pairs
-        self.asked: list[Scenario] = []
-        self.tools = Tools(draw=load_small, simulate=self._copy)
-
-    def run(self, folder: Path, plan: Plan, **options: Any) -> tuple[RunFolder, RunOutcome]:
-        run = start_run_folder(folder)
-        return run, run_plan(plan, run, **{"tools": self.tools, **options})
-
-    def families(self) -> list[str]:
-        return [scenario.family for scenario in self.asked]
-
-    def _copy(self, scenario: Scenario, seed: int, out: Path, on_stage: object) -> None:
-        """Copy a pair, and write down what was asked for, as the simulator does."""
-        self.asked.append(scenario)
-        assert seed == 20000
-        shutil.copytree(self._pairs[scenario.family], out)
-        drawn, files = scenario.model_dump(mode="json"), file_digests(scenario)
-        write_pair_truth(out, replace(read_pair_truth(out), seed=seed, scenario=drawn, files=files))
-
-
-@pytest.fixture
-def runner(pairs: dict[str, Path]) -> Runner:
-    return Runner(pairs)
-
-
-def plan_of(folder: Path, *, scenarios: str = ONE_BOX, variants: str = "{preset: voxel-diff}", rest: str = "") -> Plan:
-    path = folder / "plan.yaml"
-    path.write_text(f"name: test\nscenarios: [{scenarios}]\nseeds: [20000]\nvariants: [{variants}]\n{rest}")
-    return load_plan(str(path))
-
-
-def table(run: RunFolder, name: str = "results") -> pd.DataFrame:
-    return pd.read_csv(run.path / f"{name}.csv", keep_default_na=True)
-
-
-@pytest.fixture(scope="module")
-def smoke(pairs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """The smoke plan, run once end to end."""
-    folder = tmp_path_factory.mktemp("smoke") / "run"
-    return Runner(pairs).run(folder, load_plan("smoke"), command=["tunnelcd", "run", "a b"])[0]
-
-
-@pytest.fixture
-def smoke_copy(smoke: RunFolder, tmp_path: Path) -> RunFolder:
-    shutil.copytree(smoke.path, tmp_path / "run")
-    return RunFolder(tmp_path / "run")
+from tests.eval.running.runs import (
+    MAPLESS,
+    ONE_BOX,
+    UNCHANGED,
+    VARIANTS,
+    Runner,
+    Told,
+    load_small,
+    plan_of,
+    table,
+)
 
 
 def test_smoke_plan_end_to_end(smoke: RunFolder) -> None:
@@ -342,16 +274,6 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, runner: Run
     assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(2, 2, 0)
 
 
-class Told(Silent):
-    """Remembers which stages were begun."""
-
-    def __init__(self) -> None:
-        self.stages: list[str] = []
-
-    def stage(self, name: str, done: int, total: int) -> None:
-        self.stages.append(name)
-
-
 def test_stages_are_shared_by_the_settings_they_depend_on(tmp_path: Path, runner: Runner) -> None:
     told = Told()
     coarse = 'set: ["map.voxel_m=0.3"]'
@@ -489,237 +411,6 @@ def test_scoring_again_changes_nothing_before_all_is_scored(smoke_copy: RunFolde
     assert files == {path: path.stat().st_mtime_ns for path in files}
 
 
-WORLDS = f"{ONE_BOX}, {{name: {ONE_BOX}, set: [sensor.range_noise=false], each: [sensor.sub_rays=7]}}"
-QUIET = f"{ONE_BOX}[sensor.range_noise=false]"
-BLURRED = f"{ONE_BOX}[sensor.range_noise=false][sensor.sub_rays=7]"
-
-
-def test_worlds_are_simulated_with_their_settings_and_named_by_them(tmp_path: Path, runner: Runner) -> None:
-    run, outcome = runner.run(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
-    assert outcome == RunOutcome(3, 0, 0)
-    sensors = [scenario.sensor for scenario in runner.asked]
-    assert [(each.range_noise, each.sub_rays) for each in sensors] == [(True, 1), (False, 1), (False, 7)]
-    results = table(run)
-    assert results["scenario"].tolist() == [ONE_BOX, QUIET, BLURRED]
-    assert set(results["family"]) == {ONE_BOX}
-    assert list(run.provenance()["config_digests"]) == [f"{world} voxel-diff" for world in (ONE_BOX, QUIET, BLURRED)]
-    assert sorted(path.name for path in (run.path / "pairs").iterdir()) == [
-        "smoke__one_box",
-        "smoke__one_box_sensor.range_noise=false_",
-        "smoke__one_box_sensor.range_noise=false__sensor.sub_rays=7_",
-    ]
-    # the stand-in gives every world the same returns
-    effects = table(run, "effects")
-    assert set(effects["settings"]) == {"sensor.range_noise=false", "sensor.sub_rays=7"}
-    assert effects.groupby("settings")["reference"].unique().map(list).tolist() == [[ONE_BOX], [QUIET]]
-    assert (effects["difference"].dropna() == 0).all()
-    assert set(effects.query("metric == 'region_recall'")["n"]) == {1}
-
-
-def test_effects_that_are_no_more_leave_no_table(tmp_path: Path, runner: Runner) -> None:
-    run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
-    assert (run.path / "effects.csv").exists()
-    for world in (QUIET, BLURRED):
-        remove(run.cell(world, 20000, "voxel-diff"))
-    write_tables(run)
-    assert not (run.path / "effects.csv").exists()
-
-
-def test_scoring_again_names_worlds_as_running_does(tmp_path: Path, runner: Runner) -> None:
-    labels: list[str] = []
-
-    class Heard(Silent):
-        def cells(self, label: str, done: int, total: int) -> None:
-            labels.append(label)
-
-    run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
-    shutil.copytree(run.answer(QUIET, 20000, "voxel-diff"), run.answer(QUIET, 20000, "foreign"))
-    rescore(run, Heard())
-    named = [f"{world} 20000 voxel-diff" for world in (ONE_BOX, QUIET, BLURRED)]
-    assert sorted(labels) == sorted([*named, f"{QUIET} 20000 foreign", "done"])
-
-
-def test_the_pair_of_a_world_is_kept_while_its_scenario_is_the_same(tmp_path: Path, runner: Runner) -> None:
-    plan = plan_of(tmp_path, scenarios=WORLDS)
-    run, _ = runner.run(tmp_path / "run", plan)
-    assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(0, 3, 0)
-    run.cell(QUIET, 20000, "voxel-diff").unlink()
-    assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(1, 2, 0)
-    assert len(runner.asked) == 3
-    # the same label, but the scenario behind it has changed
-    changed = replace(
-        runner.tools, draw=lambda name, seed, settings: load_small(name, seed, [*settings, "score_radius_m=5"])
-    )
-    run.cell(ONE_BOX, 20000, "voxel-diff").unlink()
-    assert runner.run(tmp_path / "run", plan, tools=changed)[1] == RunOutcome(3, 0, 0)
-    assert len(runner.asked) == 6
-
-
-def test_a_pair_is_made_again_when_a_file_that_its_scenario_names_has_changed(tmp_path: Path, runner: Runner) -> None:
-    profile = tmp_path / "sensor.json"
-    profile.write_text(json.dumps(load_profile("os1-32-u0").to_json()))
-    scenario = tmp_path / "mine.yaml"
-    scenario.write_text(f"extends: {ONE_BOX}\nfamily: {ONE_BOX}\nsensor: {{profile: sensor.json}}\n")
-    plan = plan_of(tmp_path, scenarios=str(scenario))
-    run, _ = runner.run(tmp_path / "run", plan)
-    content = profile.read_bytes()
-    truth = read_pair_truth(run.pair(str(scenario), 20000))
-    assert list(truth.files.values()) == [hashlib.sha256(content).hexdigest()]
-    assert [Path(name).resolve() for name in truth.files] == [profile.resolve()]
-    # touched, or moved away and back: nothing is redone
-    profile.unlink()
-    profile.write_bytes(content)
-    assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(0, 1, 0)
-    profile.write_bytes(content + b"\n")
-    assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(1, 0, 0)
-    assert len(runner.asked) == 2
-    # and a pair of before is not taken for one of now when only its cell is lost
-    profile.write_bytes(content)
-    run.cell(str(scenario), 20000, "voxel-diff").unlink()
-    assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(1, 0, 0)
-    assert len(runner.asked) == 3
-
-
-def test_a_world_with_settings_that_cannot_be_made_keeps_its_family(tmp_path: Path, runner: Runner) -> None:
-    def fails_with_settings(name: str, seed: int, settings: tuple[str, ...]) -> Scenario:
-        if settings:
-            raise ScenarioError("props stand in each other")
-        return load_small(name, seed)
-
-    tools = replace(runner.tools, draw=fails_with_settings)
-    run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS), tools=tools)
-    results = table(run)
-    assert results["status"].tolist() == ["ok", "failed", "failed"]
-    assert set(results["family"]) == {ONE_BOX}
-    assert table(run, "effects").query("metric == 'region_recall'")["n"].tolist() == [0, 0]
-
-
-def test_an_answer_beside_those_of_a_world_gets_the_name_of_the_world(tmp_path: Path, runner: Runner) -> None:
-    run, _ = runner.run(tmp_path / "run", plan_of(tmp_path, scenarios=WORLDS))
-    shutil.copytree(run.answer(QUIET, 20000, "voxel-diff"), run.answer(QUIET, 20000, "theirs"))
-    assert rescore(run) == 4
-    theirs = table(run).query("variant == 'theirs'")
-    assert theirs["scenario"].tolist() == [QUIET]
-    # where the run has no cell of the pair left, the folder's name has to do
-    remove(run.path / "cells")
-    rescore(run)
-    assert "smoke/one_box_sensor.range_noise=false_" in set(table(run)["scenario"])
-
-
-MAPLESS = "{preset: tunnelcd, set: [map.max_range_m=0.1]}"  # no return is so near
-MERGES = ", ".join(
-    (
-        "{preset: tunnelcd}",
-        '{preset: tunnelcd, set: ["merge.min_hessian_ratio=1"]}',
-        MAPLESS,
-        "{preset: tunnelcd, oracle_merge: {}}",
-        "{preset: tunnelcd, oracle_merge: {noise_m: 0.3, noise_deg: 1}}",
-    )
-)
-UNMAPPED = "tunnelcd[map.max_range_m=0.1]"
-REFUSED = "tunnelcd[merge.min_hessian_ratio=1]"
-NOISY = "oracle-merge[noise_m=0.3,noise_deg=1]"
-ONE_CLEAN = f"{{name: {ONE_BOX}, pair_kind: clean}}"
-
-
-@pytest.fixture(scope="module")
-def merges(pairs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """A plan that ends at the merge; one of its variants cannot map the sessions."""
-    folder, told = tmp_path_factory.mktemp("merges"), Told()
-    plan = plan_of(folder, scenarios=f"{ONE_CLEAN}, {UNCHANGED}", variants=MERGES, rest="until: merge")
-    run, _ = Runner(pairs).run(folder / "run", plan, progress=told)
-    assert "merge" in told.stages and "query" not in told.stages
-    return run
-
-
-@pytest.fixture
-def merges_copy(merges: RunFolder, tmp_path: Path) -> RunFolder:
-    shutil.copytree(merges.path, tmp_path / "run")
-    return RunFolder(tmp_path / "run")
-
-
-def test_a_plan_that_ends_at_the_merge_has_every_case_and_no_more_than_the_merge(merges: RunFolder) -> None:
-    results = table(merges).set_index(["scenario", "variant"])
-    assert results["status"].tolist() == ["ok", "merge_refused", "failed", "ok", "ok"] * 2
-    assert "map.max_range_m = 0.1" in results.loc[(ONE_BOX, UNMAPPED), "error"]
-    later = [name for name in results.columns if name.startswith(("region_", "object_", "t_cd", "t_oe", "t_total"))]
-    assert len(later) > 15
-    assert results[[*later, "n_regions", "n_objects", "is_alarm"]].isna().all(axis=None)
-    assert results["overlap_true"].notna().all()
-    merged = results[results["status"] == "ok"]
-    assert merged[["merge_error_m", "t_index_s", "t_merge_s", "t_refine_s", "t_descriptor_s"]].notna().all(axis=None)
-    assert (merged["merge_error_m"].loc[:, ["tunnelcd", "oracle-merge"]] < 0.1).all()
-    refused = results.loc[(ONE_BOX, REFUSED)]
-    assert np.isfinite(refused["evidence_hessian_ratio"])
-    for name in ("changes", "regions", "objects", "keyframes"):
-        assert len(table(merges, name)) == 0
-    assert merges.provenance()["plan"]["until"] == "merge"
-    assert read_answer(merges.answer(ONE_BOX, 20000, "tunnelcd")).until == "merge"
-    assert read_answer(merges.answer(ONE_BOX, 20000, UNMAPPED)).until == "merge"
-
-
-def test_only_a_merge_that_asks_the_descriptors_is_charged_for_them(merges: RunFolder) -> None:
-    seconds = table(merges).set_index(["scenario", "variant"])["t_descriptor_s"]
-    assert seconds[ONE_BOX, "tunnelcd"] > 0
-    assert seconds[ONE_BOX, "oracle-merge"] == 0
-
-
-def test_the_kind_of_a_pair_is_a_column(merges: RunFolder) -> None:
-    results = table(merges)
-    assert list(results.columns)[:4] == ["scenario", "family", "pair_kind", "seed"]
-    kinds = results.fillna({"pair_kind": ""}).groupby("scenario")["pair_kind"].unique().map(list).to_dict()
-    assert kinds == {ONE_BOX: ["clean"], UNCHANGED: [""]}
-    assert "pair_kind" not in set(table(merges, "summary")["metric"])
-
-
-def test_scoring_again_keeps_the_kind_and_the_end(merges_copy: RunFolder) -> None:
-    before = table(merges_copy)
-    shutil.copytree(merges_copy.answer(ONE_BOX, 20000, "tunnelcd"), merges_copy.answer(ONE_BOX, 20000, "theirs"))
-    foreign = merges_copy.answer(ONE_BOX, 20000, "theirs") / "answer.json"
-    with pytest.raises(InputError, match=r"theirs/answer\.json: until = 'merge': a plan alone"):
-        rescore(merges_copy)
-    foreign.write_text(foreign.read_text().replace('"until": "merge"', '"until": null'))
-    rescore(merges_copy)
-    after = table(merges_copy)
-    theirs = after[after["variant"] == "theirs"]
-    assert (theirs["pair_kind"].tolist(), theirs["scenario"].tolist()) == (["clean"], [ONE_BOX])
-    pd.testing.assert_frame_equal(after[after["variant"] != "theirs"], before)
-
-
-def test_an_error_of_an_oracle_is_its_noise(merges: RunFolder) -> None:
-    results = table(merges).set_index(["scenario", "variant"])
-    for scenario in (ONE_BOX, UNCHANGED):
-        exact, noisy = results.loc[(scenario, "oracle-merge")], results.loc[(scenario, NOISY)]
-        # the odometry of these pairs drifts, and between keyframes the alignment is blended
-        assert exact["merge_error_m"] < 0.002
-        assert noisy["merge_error_m"] == pytest.approx(0.3, abs=0.01)
-        assert noisy["merge_error_deg"] == pytest.approx(1.0, abs=0.02)
-        assert noisy[["t_index_s", "t_merge_s", "t_refine_s", "evidence_n_hypotheses"]].tolist() == [0, 0, 0, 0]
-
-
-def test_the_page_of_a_run_that_ends_at_the_merge(
-    merges_copy: RunFolder, command: Callable[..., tuple[int, str, str]]
-) -> None:
-    code, _, err = command("report", merges_copy.path)
-    assert (code, err) == (0, "")
-    page = (merges_copy.path / "index.html").read_text()
-    for words in ("merge refused", "map.max_range_m = 0.1", "oracle-merge"):
-        assert words in page
-
-
-def test_what_is_printed_of_a_run_that_ends_at_the_merge(
-    merges_copy: RunFolder, command: Callable[..., tuple[int, str, str]]
-) -> None:
-    code, out, _ = command("score", merges_copy.path)
-    assert code == 0
-    assert "merge [m]" in out and "recall" not in out
-    lines = out.splitlines()
-    assert len(lines) <= 25 and "summary.csv" in out
-    assert max(len(line) for line in lines if str(merges_copy.path) not in line) <= 80
-    code, out, _ = command("score", merges_copy.path, "--wide")
-    assert code == 0 and "merge_error_m" in out and "region_recall" not in out
-
-
 def test_an_oracle_runs_the_stages_of_its_preset(tmp_path: Path, runner: Runner) -> None:
     later = 'set: ["query.n_regions=2", "query.threshold=0"]'
     variants = f"{{preset: tunnelcd, {later}}}, {{preset: tunnelcd, {later}, oracle_merge: {{}}}}"
@@ -753,17 +444,6 @@ def test_what_a_plan_says_of_a_cell_redoes_it(
     assert runner.run(tmp_path / "run", changed)[1] == RunOutcome(0, 1, 0)
     # the pair itself is the same
     assert runner.families() == [ONE_BOX]
-
-
-def test_a_world_that_cannot_be_made_keeps_its_kind(tmp_path: Path, runner: Runner) -> None:
-    def fails(*_: object) -> Scenario:
-        raise ScenarioError("props stand in each other")
-
-    plan = plan_of(tmp_path, scenarios=ONE_CLEAN, variants=MERGES, rest="until: merge")
-    run, _ = runner.run(tmp_path / "run", plan, tools=replace(runner.tools, draw=fails))
-    results = table(run)
-    assert results["status"].tolist() == ["failed"] * 5
-    assert set(results["pair_kind"]) == {"clean"}
 
 
 def test_cells_are_made_again_with_another_version_of_an_extra_that_they_may_ask(

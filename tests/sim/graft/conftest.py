@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from cdpipe.io.session import Session, read_session
-from scenarios.grafted import GraftScenario, Recording
+from scenarios.grafted import GraftScenario, Recording, RockChange
 from scenarios.schema import Platform, Prop, Scenario
 
 SEED = 10007
@@ -28,6 +28,7 @@ def recording(simulated_once: Callable[[Scenario, int], Path], make_scenario: Ca
     return read_session(pair / "before")
 
 
-def make_graft(*props: dict[str, Any], **override: Any) -> GraftScenario:
+def make_graft(*props: dict[str, Any], surface: tuple[RockChange, ...] = (), **override: Any) -> GraftScenario:
     told = {"sessions": ("drive",), "split": "alternate", "reach_m": 4.0, "clearance_m": 0.5, **override}
-    return GraftScenario(family="test", props=tuple(Prop(**prop) for prop in props), recording=Recording(**told))
+    recording, placed = Recording(**told), tuple(Prop(**prop) for prop in props)
+    return GraftScenario(family="test", props=placed, surface=surface, recording=recording)

@@ -6,7 +6,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from eval.report.framing.headline import name_leaders, write_answer, write_title
+from eval.report.framing.headline import name_by_setting, name_leaders, write_answer, write_title
 from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
 from eval.tables.columns import Column, share
@@ -63,6 +63,28 @@ def test_each_domain_has_its_leaders(tmp_path: Path) -> None:
         "Highest region recall, in distribution: tunnelcd (0.90), before c2c (0.50); "
         "out of distribution: c2c (0.40), before tunnelcd (0.20)."
     )
+
+
+@pytest.mark.parametrize(
+    ("variants", "told"),
+    [
+        (("m[a.b=x]", "m[a.b=y,c.d=2]"), ("a.b", {"m[a.b=x]": "x", "m[a.b=y,c.d=2]": "y"})),
+        (("m[a.b=x]", "m"), ("", {})),
+        (("m[a.b=x]", "n[a.b=y]"), ("", {})),
+        (("m[a.b=x]", "m[a.c=y]"), ("", {})),
+        (("m[a.b=x,c.d=1]", "m[a.b=x,c.d=2]"), ("", {})),
+        ((), ("", {})),
+    ],
+)
+def test_variants_of_one_setting(variants: tuple[str, ...], told: tuple[str, dict[str, str]]) -> None:
+    assert name_by_setting(variants) == told
+
+
+def test_leaders_that_differ_by_a_setting_are_named_by_it(tmp_path: Path) -> None:
+    values = {"m[a.b=x]": 0.9, "m[a.b=y,c.d=2]": 0.5, "oracle-merge[a.b=x]": 1.0}
+    rows = [{"scenario": "narrow", "variant": name, "region_recall": value} for name, value in values.items()]
+    told = write_answer(run(tmp_path, rows), pd.DataFrame())
+    assert told == "Highest region recall by a.b, in distribution: x (0.90), before y (0.50)."
 
 
 def test_a_plan_with_axes_says_on_how_many_its_leader_holds(tmp_path: Path) -> None:
