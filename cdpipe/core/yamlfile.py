@@ -215,7 +215,8 @@ def suggest(word: str, known: Iterable[str], prefix: str = "") -> str:
 
 
 # What pydantic says in the words of Python, in those of a file.
-_LIST, _GROUP = "expected a list, such as [a, b] or lines that begin with -", "expected keys with values, such as {key: value}"
+_LIST = "expected a list, such as [a, b] or lines that begin with -"
+_GROUP = "expected keys with values, such as {key: value}"
 _OF_YAML = {"tuple_type": _LIST, "list_type": _LIST, "dict_type": _GROUP, "model_type": _GROUP}
 
 

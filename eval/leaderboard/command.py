@@ -58,8 +58,8 @@ def parse_command(text: str, *, gets_merge: bool) -> tuple[str, ...]:
     """Return the words of a command; those with a dot or a slash that name a file or folder are made absolute.
 
     Raises:
-        InputError: It is no command, its program or script is not found, a placeholder is missing or unknown, or {merge} stands
-            there where no merge is given, or does not where one is.
+        InputError: It is no command, its program or script is not found, a placeholder is missing or unknown, or
+            {merge} stands there where no merge is given, or does not where one is.
     """
     try:
         words = shlex.split(text)

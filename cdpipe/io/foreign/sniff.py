@@ -120,8 +120,8 @@ def _guess_folder(folder: Path) -> str:
         raise InputError(f"{folder}: scans of several formats ({told}): name one, --format {' or '.join(found)}")
     if not found:
         raise InputError(
-            f"{folder}: no scans in it{_tell_content(folder)}: expected session.json (a session of ours), or *.ply, *.pcd, *.las, "
-            "*.laz or *.bin scans with a trajectory, or a bag"
+            f"{folder}: no scans in it{_tell_content(folder)}: expected session.json (a session of ours), or *.ply, "
+            "*.pcd, *.las, *.laz or *.bin scans with a trajectory, or a bag"
         )
     return next(iter(found))
 

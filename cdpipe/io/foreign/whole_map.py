@@ -99,7 +99,7 @@ def _suggest_offset(points: Float64Array) -> str:
     if np.abs(points - middle).max() > _SITE_M or np.abs(middle).max() < _SITE_M:
         return ""
     offset = ", ".join(f"{value:.0f}" for value in np.round(middle, -3))
-    return f"coordinates of a map grid (UTM)? Subtract ({offset}) from the points of both maps, and see that units are m"
+    return f"coordinates of a map grid (UTM)? Subtract ({offset}) metres from the points of both maps"
 
 
 def find_stations(points: Float64Array) -> Float64Array:

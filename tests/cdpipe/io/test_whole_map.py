@@ -96,7 +96,7 @@ def test_a_map_without_a_floor_is_refused(tmp_path: Path, points: Float64Array) 
 
 def test_a_map_in_the_coordinates_of_a_country_is_refused_with_the_offset_to_subtract(tmp_path: Path) -> None:
     points = drift(1)[:2_000] + np.array([432_010.0, 5_411_020.0, 320.0])
-    with pytest.raises(InputError, match=r"map grid \(UTM\)\? Subtract \(432000, 5411000, 0\) from the points of both"):
+    with pytest.raises(InputError, match=r"map grid \(UTM\)\? Subtract \(432000, 5411000, 0\) metres from"):
         open_session(write(tmp_path / "utm.ply", points))
 
 

@@ -78,6 +78,12 @@ def test_the_same_results_give_the_same_bytes(evaluated: RunFolder, packed: Path
     assert (tmp_path / "again.zip").read_bytes() == packed.read_bytes()
 
 
+def test_a_method_that_was_not_evaluated_is_answered_with_those_that_were(run: RunFolder, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"--as nobody: no method of this name was evaluated here, but mine$"):
+        pack_submission(run, "nobody", tmp_path / "x.zip")
+    assert not (tmp_path / "x.zip").exists()
+
+
 def test_results_that_lack_a_pair_are_not_packed(run: RunFolder, tmp_path: Path) -> None:
     run.cell(ONE_BOX, 20000, "mine").unlink()
     with pytest.raises(InputError, match=r"mine lacks 1 of 2 pairs \(smoke/one_box 20000\)"):
