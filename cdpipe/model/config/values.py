@@ -6,11 +6,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
+from cdpipe.core.yamlfile import suggest
+
 
 def _require_width(value: Any) -> Any:
     # pydantic would ask for the word alone
     if value != "width":
-        raise ValueError('expected a length in metres, above 0, or the word "width"')
+        raise ValueError(f"input should be a length in metres, above 0, or 'width'{suggest(str(value), ['width'])}")
     return value
 
 

@@ -190,6 +190,6 @@ def test_a_dump_names_the_settings_of_one_rival_only_where_they_count() -> None:
 
 
 def test_a_radius_that_is_no_number_is_told_of_both_kinds_of_value() -> None:
-    with pytest.raises(InputError, match=r"radius_m = 'abc': expected a length in metres, above 0, or the word"):
+    with pytest.raises(InputError, match=r"radius_m = 'abc': input should be a length in metres, above 0, or 'width'"):
         load_config("tunnelcd", ["query.radius_m=abc"])
     assert load_config("tunnelcd", ["query.radius_m=width"]).query.radius_m == "width"
