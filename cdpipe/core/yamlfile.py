@@ -111,7 +111,8 @@ def validate(model: type[ModelT], document: Document) -> ModelT:
             100; of more than 50,000 the number alone.
     """
     if not isinstance(document.value, dict):
-        raise InputError(f"{document.source}: expected keys and values, got {type(document.value).__name__}")
+        found = "nothing in it" if document.value is None else type(document.value).__name__
+        raise InputError(f"{document.source}: expected keys and values, got {found}")
     try:
         return model.model_validate(document.value)
     except ValidationError as error:
@@ -213,6 +214,12 @@ def suggest(word: str, known: Iterable[str], prefix: str = "") -> str:
     return f'; did you mean "{prefix}{close[0]}"?' if close else ""
 
 
+# What pydantic says in the words of Python, in those of a file.
+_LIST = "expected a list, such as [a, b] or lines that begin with -"
+_GROUP = "expected keys with values, such as {key: value}"
+_OF_YAML = {"tuple_type": _LIST, "list_type": _LIST, "dict_type": _GROUP, "model_type": _GROUP}
+
+
 def _describe_mistake(model: type[BaseModel], document: Document, error: Any) -> str:
     key = tuple(error["loc"])
     # pydantic adds the names of union alternatives to the location; keep the keys that exist in the document
@@ -227,7 +234,7 @@ def _describe_mistake(model: type[BaseModel], document: Document, error: Any) ->
     expected = error.get("ctx", {}).get("expected")
     if error["type"] == "literal_error" and isinstance(error["input"], str):
         hint = suggest(error["input"], [word.strip(" '\"") for word in expected.replace(" or ", ",").split(",")])
-    rule = error["msg"].removeprefix("Value error, ")
+    rule = _OF_YAML.get(error["type"], error["msg"].removeprefix("Value error, "))
     rule = rule[0].lower() + rule[1:] if not rule[:2].isupper() else rule
     return f"{where}: {name} = {_brief(error['input'])}: {rule}{hint}" if name else f"{where}: {rule}{hint}"
 

@@ -121,7 +121,8 @@ def _parse_header(content: bytes) -> _Header:
 def _vertices(content: bytes, header: _Header, wanted: Sequence[str]) -> Float64Array:
     """Return the wanted properties (N, P) of all vertices."""
     if header.n_vertices > len(content):
-        raise ValueError(f"{header.n_vertices:.3g} vertices are announced in a file of {len(content)} bytes")
+        told = f"{header.n_vertices:.3g}" if header.n_vertices > 10**12 else str(header.n_vertices)
+        raise ValueError(f"{told} vertices are announced in a file of {len(content)} bytes: it is damaged or cut short")
     names = [name for name, _ in header.properties]
     if header.encoding == "ascii":
         lines = content[header.size :].split(b"\n", header.n_vertices)[: header.n_vertices]

@@ -34,6 +34,7 @@ MERGE_WORD = "merge"
 STDERR_BYTES = 16_000
 _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _EXAMPLE = 'expected e.g. --command "python predict.py {before} {after} {out}"'
+_SCRIPT_SUFFIXES = (".py", ".sh", ".jl", ".R", ".pl")
 _BLOCK_BYTES = 1 << 14
 _PIPE_WAIT_S = 5.0
 
@@ -57,8 +58,8 @@ def parse_command(text: str, *, gets_merge: bool) -> tuple[str, ...]:
     """Return the words of a command; those with a dot or a slash that name a file or folder are made absolute.
 
     Raises:
-        InputError: It is no command, its program is not found, a placeholder is missing or unknown, or {merge} stands
-            there where no merge is given, or does not where one is.
+        InputError: It is no command, its program or script is not found, a placeholder is missing or unknown, or
+            {merge} stands there where no merge is given, or does not where one is.
     """
     try:
         words = shlex.split(text)
@@ -67,6 +68,7 @@ def parse_command(text: str, *, gets_merge: bool) -> tuple[str, ...]:
     if not words:
         raise InputError(f"--command is empty: {_EXAMPLE}")
     _check_placeholders(text, gets_merge=gets_merge)
+    _check_script(words[1:])
     words = [_find_program(words[0]), *map(_make_absolute, words[1:])]
     return tuple(words)
 
@@ -139,6 +141,18 @@ def _find_program(word: str) -> str:
         raise InputError(f"--command: {visible(word)}: no such program: name one of the PATH, or its file")
     # a program of the PATH keeps its name: links of virtual environments look at the name that they are called by
     return str(Path(found).absolute()) if os.sep in word else word
+
+
+def _check_script(words: Sequence[str]) -> None:
+    """Refuse a script that does not exist: the command would fail on every pair, after all are simulated."""
+    script = Path(words[0]) if words else Path()
+    if script.suffix not in _SCRIPT_SUFFIXES or "{" in words[0] or words[0].startswith("-") or script.exists():
+        return
+    beside = (str(script.with_name(each.name)) for each in script.parent.glob(f"*{script.suffix}"))
+    raise InputError(
+        f"--command: {visible(words[0])}: no such file in {visible(str(Path.cwd()))}{suggest(words[0], list(beside))}: "
+        "name the script by its path from there, or by its whole path"
+    )
 
 
 def _digest_file(path: Path) -> str:

@@ -80,7 +80,7 @@ def write_leaderboard(files: Sequence[CheckedFile], out: Path, reference: Path |
          "version": each.content.versions.get("tunnelcd", "")}
         for each, n in zip(files, checked, strict=True)
     ]  # fmt: skip
-    columns = [SHOWN[key] for key in FIGURES]
+    columns = list(zip(HEADINGS, (SHOWN[key] for key in FIGURES), strict=True))
     headings = ("method", "merge", "pairs", *HEADINGS)
     content = {"boards": boards, "headings": headings, "files": told, "columns": columns}
     with made_parents(out):

@@ -24,7 +24,7 @@ from pydantic import AfterValidator, ConfigDict, Field
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import list_members, parse_json, read_bytes, read_member, require_plain_file
-from cdpipe.core.names import LONGEST, visible
+from cdpipe.core.names import LONGEST, path_part, visible
 from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.io.answer_parts import MAX_ERROR
 from eval.core.output import made_parents, require_replaceable, unwritable, whole_file
@@ -130,7 +130,7 @@ def pack_submission(run: RunFolder, name: str, out: Path) -> int:
     if out.suffix != ".zip" or out.is_dir():
         raise InputError(f"--out {out}: expected the name of a new file that ends in .zip")
     require_replaceable(out, _HEAD, "file of `tunnelcd submit`")
-    evaluation = read_evaluation(run, name or _find_only(run))
+    evaluation = read_evaluation(run, _find_method(run, name))
     parts, answers = _collect(run, evaluation)
     told = {
         "name": evaluation.name, "command": [_without_folders(word) for word in evaluation.command],
@@ -256,13 +256,16 @@ def _collect(run: RunFolder, evaluation: EvaluationFile) -> tuple[list[PairPart]
     return parts, answers
 
 
-def _find_only(run: RunFolder) -> str:
+def _find_method(run: RunFolder, name: str) -> str:
     names = [path.parent.name for path in sorted(run.path.glob("evaluations/*/evaluation.json"))]
     if not names:
         raise InputError(f"{run.path}: no method was evaluated here: `tunnelcd evaluate --out {run.path}` first")
-    if len(names) > 1:
-        raise InputError(f"{run.path}: holds {', '.join(names)}: name one with --as")
-    return names[0]
+    told = ", ".join(map(visible, names))
+    if name and path_part(name) not in names:
+        raise InputError(f"{run.path}: --as {name}: no method of this name was evaluated here, but {told}")
+    if not name and len(names) > 1:
+        raise InputError(f"{run.path}: holds {told}: name one with --as")
+    return name or names[0]
 
 
 def _check_rows(document: Submission) -> None:

@@ -34,9 +34,10 @@ def read_plan(name_or_path: str) -> Document:
         return _resolve_files(read_yaml(Path(name_or_path)), Path(name_or_path).parent)
     plans = plan_files()
     if name_or_path not in plans:
+        beside = f"{name_or_path}.yaml"
+        near = f'; did you mean the file "{beside}"?' if Path(beside).is_file() else suggest(name_or_path, plans)
         raise InputError(
-            f"plan {name_or_path!r} is unknown{suggest(name_or_path, plans)} "
-            f"(known: {', '.join(plans)}, or the path of a .yaml file)"
+            f"plan {name_or_path!r} is unknown{near} (known: {', '.join(plans)}, or the path of a .yaml file)"
         )
     document = read_yaml(Path(f"{name_or_path}.yaml"), plans[name_or_path].read_text(encoding="utf-8"))
     return _resolve_files(document, Path(str(plans[name_or_path])).parent)

@@ -177,4 +177,6 @@ def _reads(path: str, what: str) -> Iterator[None]:
         if not isinstance(error, _ERRORS) and type(error).__module__.split(".")[0] not in _LIBRARY_MODULES:
             raise
         told = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: not a readable {what.split(' ', 1)[1]}: {told[:300]}") from error
+        raise InputError(
+            f"{path}: not a readable {what.split(' ', 1)[1]}: {told[:300]}: copy or export it again"
+        ) from error

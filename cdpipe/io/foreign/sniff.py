@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,13 +119,23 @@ def _guess_folder(folder: Path) -> str:
         told = ", ".join(f"{count} {name}" for name, count in found.items())
         raise InputError(f"{folder}: scans of several formats ({told}): name one, --format {' or '.join(found)}")
     if not found:
-        names = [sub.name for sub in sorted(folder.iterdir()) if sub.is_dir()][:3]
-        inside = f" (there are folders: {', '.join(map(visible, names))})" if names else ""
         raise InputError(
-            f"{folder}: no scans in it{inside}: expected session.json (a session of ours), or *.ply, *.pcd, *.las, "
-            "*.laz or *.bin scans with a trajectory, or a bag"
+            f"{folder}: no scans in it{_tell_content(folder)}: expected session.json (a session of ours), or *.ply, "
+            "*.pcd, *.las, *.laz or *.bin scans with a trajectory, or a bag"
         )
     return next(iter(found))
+
+
+def _tell_content(folder: Path) -> str:
+    """Return what a folder without scans holds, in brackets, or "" for nothing."""
+    inside = sorted(folder.iterdir())
+    if names := [each.name for each in inside if each.is_dir()][:3]:
+        return f" (there are folders: {', '.join(map(visible, names))})"
+    counts = Counter(each.suffix for each in inside).most_common(3)
+    told = ", ".join(f"{count} {visible(f'*{suffix}') if suffix else 'without suffix'}" for suffix, count in counts)
+    single = {suffix for each in FORMATS.values() if not each.in_folders for suffix in each.suffixes}
+    way_out = "; name one of them" if single & {suffix for suffix, _ in counts} else ""
+    return f" (there are {told}{way_out})" if told else " (it is empty)"
 
 
 def _files(folder: Path, suffixes: Iterable[str]) -> list[Path]:

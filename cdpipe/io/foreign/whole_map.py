@@ -24,6 +24,8 @@ _THIN_M, _COLUMN_M = 0.2, 0.5
 _MOST_CELLS, _CELLS_A_POINT = 16_000_000, 8
 # A thinned point with no more others than this within that distance is no surface.
 _STRAY_M, _LEAST_AROUND = 0.6, 6
+# A map that reaches no farther about its middle, which itself lies farther from the origin, has coordinates of a grid.
+_SITE_M = 50_000.0
 # Free height that a sensor needs, and its height in it.
 _FREE_M, _SENSOR_M = 1.2, 1.0
 # Free distance to the walls of a station, distances between stations, and the least share of the free distance of the
@@ -57,9 +59,8 @@ class MapStations:
         try:
             stations = find_stations(points)
         except ValueError as error:
-            raise InputError(
-                f"{path}: one cloud, a map without its scans, and {error}: are lengths metres? Else cut far points away"
-            ) from error
+            way_out = _suggest_offset(points) or "are lengths metres? Else cut far points away"
+            raise InputError(f"{path}: one cloud, a map without its scans, and {error}: {way_out}") from error
         if len(stations) == 0:
             raise InputError(
                 f"{path}: one cloud, a map without its scans, and no floor with {_FREE_M} m of free height in it: z is "
@@ -90,6 +91,15 @@ class MapStations:
     def read_all(self) -> Iterator[Cloud]:
         """Return the points of all stations in order."""
         return (self.read(index) for index in range(len(self)))
+
+
+def _suggest_offset(points: Float64Array) -> str:
+    """Return what to subtract where a map is small and far from the origin, as in a national grid; else ""."""
+    middle = np.median(points, axis=0)
+    if np.abs(points - middle).max() > _SITE_M or np.abs(middle).max() < _SITE_M:
+        return ""
+    offset = ", ".join(f"{value:.0f}" for value in np.round(middle, -3))
+    return f"coordinates of a map grid (UTM)? Subtract ({offset}) metres from the points of both maps"
 
 
 def find_stations(points: Float64Array) -> Float64Array:

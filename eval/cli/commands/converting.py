@@ -128,7 +128,8 @@ def _is_session(source: Path, how: HowToRead) -> bool:
     if is_session(source) and how != HowToRead():
         given = {"metadata": how.metadata, "trajectory": how.trajectory, "odometry": how.odometry, "format": how.format}
         name = next((name for name, value in given.items() if value is not None), "topic")
-        raise InputError(f"{source}: a session has its own poses and sensor: leave --{name} out")
+        meant = " (the format that is written is --to)" if name == "format" else ""
+        raise InputError(f"{source}: a session has its own poses and sensor: leave --{name} out{meant}")
     return is_session(source)
 
 

@@ -166,6 +166,10 @@ def score(
     require_json_file(out)
     if (predictions is None) != (name is None):
         raise InputError("--predictions and --as: a run takes predictions under a name: give both, or neither")
+    if (folder / "answer.json").is_file() and answer != folder:
+        raise InputError(f"{folder}: an answer; its pair comes first: `tunnelcd score {answer or 'PAIR'} {folder}`")
+    if answer is None and (folder / "truth" / "changes.json").is_file():
+        raise InputError(f"{folder}: a pair of sessions; name an answer to it, too: `tunnelcd score {folder} ANSWER`")
     if answer is not None:
         if predictions is not None:
             raise InputError("--predictions: goes with a run folder alone, not with one pair and its answer")

@@ -265,6 +265,8 @@ def check_file(name_or_path: str) -> str:
             raise InputError(
                 f"{name_or_path}: no plan, scenario or preset of this name, and no .yaml file{near or '; see `list`'}"
             )
+        if not Path(name_or_path).exists():
+            raise InputError(f"{name_or_path}: no such file: expected a plan, a scenario or a preset in YAML")
         keys = {
             "preset": {*PipelineConfig.model_fields, "wide"},
             "plan": set(Plan.model_fields),

@@ -35,6 +35,19 @@ def test_all_mistakes_are_told_at_once_by_line() -> None:
         assert any(line.startswith(head) and hint in line for line in lines), head
 
 
+def test_a_list_and_keys_with_values_are_asked_for_in_the_words_of_a_file() -> None:
+    text = "name: a\nballs: {radius_m: 1}\nspare: 3\n"
+    with pytest.raises(InputError) as caught:
+        validate(Box, read_yaml(Path("box.yaml"), text))
+    balls, spare = str(caught.value).splitlines()
+    assert "expected a list, such as [a, b]" in balls and "expected keys with values, such as {key: value}" in spare
+
+
+def test_an_empty_file_is_called_so() -> None:
+    with pytest.raises(InputError, match=r"^box\.yaml: expected keys and values, got nothing in it$"):
+        validate(Box, read_yaml(Path("box.yaml"), ""))
+
+
 def test_mistakes_without_end_are_counted() -> None:
     text = "name: x\n" + "".join(f"unknown{number}: 1\n" for number in range(1000))
     with pytest.raises(InputError) as caught:

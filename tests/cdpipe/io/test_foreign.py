@@ -169,6 +169,21 @@ def test_clouds_of_a_bag_that_repeat_a_stamp_are_left_out(tmp_path: Path) -> Non
     assert "too few stamps (1 on 6 clouds): header.stamp was not set" in text
 
 
+def test_a_folder_without_scans_tells_what_it_holds(tmp_path: Path) -> None:
+    assert "no scans in it (it is empty): expected" in said(tmp_path)
+    for name in ("a.json", "b.json", "README"):
+        (tmp_path / name).write_text("{}")
+    assert "(there are 2 *.json, 1 without suffix): expected" in said(tmp_path)
+    (tmp_path / "a.osf").write_text("")
+    assert "1 *.osf; name one of them): expected" in said(tmp_path)
+
+
+def test_a_las_that_was_cut_short_names_a_way_out(tmp_path: Path) -> None:
+    path = write_lases(tmp_path / "run", MADE, ".las") / "000000.las"
+    path.write_bytes(path.read_bytes()[:-7])
+    assert said(path).endswith(": copy or export it again")
+
+
 def test_a_bag_that_is_none_says_so(tmp_path: Path) -> None:
     for number, content in enumerate((b"x", b"")):
         path = tmp_path / f"{number}.bag"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.errors import InputError
-from cdpipe.io.ply import read_ply_points
+from cdpipe.io.ply import read_ply_points, write_ply_points
 
 POINTS = np.array([[1.5, -2.0, 3.25], [4.0, 5.0, -6.5]])
 
@@ -87,3 +87,11 @@ def test_a_count_beyond_any_file_is_named(tmp_path: Path, kind: str) -> None:
     (tmp_path / "a.ply").write_text(f"ply\nformat {kind} 1.0\nelement vertex {10**29}\n{axes}end_header\n1 2 3\n")
     with pytest.raises(InputError, match="1e\\+29 vertices are announced"):
         read_ply_points(tmp_path / "a.ply")
+
+
+def test_a_scan_that_was_cut_short_early_says_so_with_the_count_that_its_header_has(tmp_path: Path) -> None:
+    path = tmp_path / "cut.ply"
+    write_ply_points(path, np.zeros((69_783, 3)))
+    path.write_bytes(path.read_bytes()[:5_000])
+    with pytest.raises(InputError, match="69783 vertices are announced in a file of 5000 bytes: it is damaged or cut"):
+        read_ply_points(path)

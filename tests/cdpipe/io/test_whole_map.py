@@ -94,6 +94,12 @@ def test_a_map_without_a_floor_is_refused(tmp_path: Path, points: Float64Array) 
         open_session(write(tmp_path / "map.ply", points))
 
 
+def test_a_map_in_the_coordinates_of_a_country_is_refused_with_the_offset_to_subtract(tmp_path: Path) -> None:
+    points = drift(1)[:2_000] + np.array([432_010.0, 5_411_020.0, 320.0])
+    with pytest.raises(InputError, match=r"map grid \(UTM\)\? Subtract \(432000, 5411000, 0\) metres from"):
+        open_session(write(tmp_path / "utm.ply", points))
+
+
 def test_a_map_of_another_unit_or_with_lost_points_is_refused_on_one_line(tmp_path: Path) -> None:
     near, apart = drift(1)[:20_000], np.array([60_000.0, 60_000.0, 0.0])
     for name, points, told in (

@@ -187,3 +187,9 @@ def test_a_dump_names_the_settings_of_one_rival_only_where_they_count() -> None:
     for preset in ("tunnelcd", "erasor"):
         config = load_config(preset, ["removert.margin=0.3"])
         assert PipelineConfig.model_validate(config.model_dump()) == config
+
+
+def test_a_radius_that_is_no_number_is_told_of_both_kinds_of_value() -> None:
+    with pytest.raises(InputError, match=r"radius_m = 'abc': input should be a length in metres, above 0, or 'width'"):
+        load_config("tunnelcd", ["query.radius_m=abc"])
+    assert load_config("tunnelcd", ["query.radius_m=width"]).query.radius_m == "width"

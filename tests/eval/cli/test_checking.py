@@ -45,3 +45,8 @@ def test_the_meshes_that_a_scenario_names_are_opened(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("name", "kind"), [("smoke", "plan"), ("narrow", "scenario"), ("paper-topn", "preset")])
 def test_shipped_names_are_known(name: str, kind: str) -> None:
     assert f"a {kind}" in check_file(name)
+
+
+def test_a_file_that_is_not_there_says_what_was_expected(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.yaml: no such file: expected a plan, a scenario or a preset"):
+        check_file(str(tmp_path / "none.yaml"))

@@ -216,6 +216,15 @@ def test_detect_takes_a_merge_that_is_known(pair: Path, tmp_path: Path, command:
     assert not (tmp_path / "bad").exists()
 
 
+def test_score_with_swapped_or_missing_folders_says_the_order(tmp_path: Path, command: Command) -> None:
+    for path in ("pair/truth/changes.json", "mine/answer.json"):
+        (tmp_path / path).parent.mkdir(parents=True)
+        (tmp_path / path).write_text("{}")
+    pair, mine = tmp_path / "pair", tmp_path / "mine"
+    assert_refused(command("score", mine, pair), f"an answer; its pair comes first: `tunnelcd score {pair} {mine}`")
+    assert_refused(command("score", pair), f"name an answer to it, too: `tunnelcd score {pair} ANSWER`")
+
+
 def test_score_of_one_answer(pair: Path, tmp_path: Path, command: Command) -> None:
     command("detect", pair / "before", pair / "after", *FINE, "--out", tmp_path / "out")
     code, out, _ = command("score", pair, tmp_path / "out")

@@ -155,6 +155,7 @@ def test_names_and_options_that_do_not_go_together(pair: Path, tmp_path: Path, c
         ((before, there / "a.osf"), "cannot write there"),
         ((before, tmp_path / "a.osf", "--odometry", "kiss-icp"), "leave --odometry out"),
         ((before, tmp_path / "a.osf", "--metadata", "m.json"), "leave --metadata out"),
+        ((before, tmp_path / "a", "--format", "kitti"), "leave --format out (the format that is written is --to)"),
         ((there, tmp_path / "b.osf"), "a recording becomes a session: name a new folder"),
         ((there, tmp_path / "b", "--with-truth"), "leave --with-truth out"),
         ((there, tmp_path / "new" / "b"), "there.osf: not an OSF file"),

@@ -33,6 +33,17 @@ def test_a_command_that_cannot_work_is_refused(text: str, gets_merge: bool, said
     assert said in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_a_script_that_is_not_there_is_refused_before_a_pair_is_simulated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("predict.py").write_text("pass")
+    with pytest.raises(InputError, match=r'predit\.py: no such file in .*; did you mean "predict\.py"'):
+        parse_command(f"{sys.executable} predit.py {WHOLE}", gets_merge=False)
+    for words in ("predict.py", "-m predit.py", "{out}/later.py", "-c pass predit.py"):
+        assert parse_command(f"{sys.executable} {words} {WHOLE}", gets_merge=False)
+
+
 def test_words_that_name_files_become_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("x.py").write_text("pass")

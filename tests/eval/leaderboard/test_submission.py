@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import zipfile
 from collections.abc import Callable
@@ -75,6 +76,12 @@ def test_what_was_packed_is_read_and_scored_again(evaluated: RunFolder, packed: 
 def test_the_same_results_give_the_same_bytes(evaluated: RunFolder, packed: Path, tmp_path: Path) -> None:
     pack_submission(evaluated, "mine", tmp_path / "again.zip")
     assert (tmp_path / "again.zip").read_bytes() == packed.read_bytes()
+
+
+def test_a_method_that_was_not_evaluated_is_answered_with_those_that_were(run: RunFolder, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"--as nobody: no method of this name was evaluated here, but mine$"):
+        pack_submission(run, "nobody", tmp_path / "x.zip")
+    assert not (tmp_path / "x.zip").exists()
 
 
 def test_results_that_lack_a_pair_are_not_packed(run: RunFolder, tmp_path: Path) -> None:
@@ -247,6 +254,16 @@ def test_the_page_shows_every_file_escaped(packed: Path, tmp_path: Path) -> None
     assert 'placeholder = "Filter rows"' in page and "<button" not in page  # tables as those of a report
     assert "2 of 2 pairs" in page and "0 of 2 pairs" in page and found.sha256 in page
     assert "http" not in page.replace("http-equiv", "")
+
+
+def test_every_heading_of_the_leaderboard_is_defined_under_the_name_that_it_has_there(
+    packed: Path, tmp_path: Path
+) -> None:
+    write_leaderboard([read_submission(packed)], tmp_path / "board.html", None, [0])
+    page = (tmp_path / "board.html").read_text()
+    headings = re.findall("<th[^>]*>([^<]+)</th>", page.partition("</thead>")[0])
+    defined = [name.partition(":")[0] for name in re.findall("<dt>([^<]+)</dt>", page)]
+    assert headings == ["method", "merge", "pairs", *defined] and len(defined) == 5
 
 
 def test_other_pairs_are_another_table_and_one_name_stands_once(packed: Path, tmp_path: Path) -> None:

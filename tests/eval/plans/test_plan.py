@@ -282,6 +282,15 @@ def test_unknown_plan_names_the_nearest() -> None:
         load_plan("smok")
 
 
+def test_a_plan_file_that_is_named_without_its_suffix_is_suggested(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("tiny.yaml").write_text("name: tiny\n")
+    with pytest.raises(InputError, match=r'did you mean the file "tiny\.yaml"'):
+        load_plan("tiny")
+
+
 def test_the_example_of_the_documentation_is_a_plan(tmp_path: Path) -> None:
     documentation = plan_module.__doc__ or ""
     plan = read(tmp_path, textwrap.dedent(documentation.partition("\n\n")[2]))

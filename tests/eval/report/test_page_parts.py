@@ -1,6 +1,7 @@
 import base64
 import io
 import math
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -187,3 +188,11 @@ def test_an_object_that_was_missed_is_drawn_black() -> None:
     assert share_of(image[:, :half], BLUE) > 0.03
     assert share_of(image[:, half:], BLUE) == 0.0
     assert share_of(image[:, half:], "#1a1a1a") > 0.03
+
+
+def test_no_rule_for_all_screens_undoes_one_for_narrow_screens() -> None:
+    css = (files("eval.report") / "templates" / "page.css").read_text(encoding="utf-8")
+    narrow, after = css.partition("@media (max-width: 40rem) {")[2].split("\n}\n", 1)
+    selectors = {line.partition("{")[0].strip() for line in narrow.splitlines() if line.strip()}
+    later = {line.partition("{")[0].strip() for line in after.partition("@media print")[0].splitlines()}
+    assert "dl" in selectors and selectors & later == set()
