@@ -21,11 +21,12 @@ def tell(report: ChangeReport) -> str:
     """Return one sentence about an answer, e.g. `5 added, 1 moved 2.3 m, 2 removed; 410 m compared, 35 m not seen`.
 
     A moved object counts once, though both its places are objects of the report. Without objects, the reported regions
-    are counted. Rock that moved is told where it was measured, the compared way where it is known.
+    are counted. Rock that moved is told where it was measured, the compared way where it is known. A report without any
+    says that no change was found, and not that there is none.
     """
     told = [*_tell_objects(report), *_tell_rock(report)]
     way = [] if report.coverage is None else [_tell_coverage(report.coverage)]
-    return "; ".join([", ".join(told) or "nothing changed", *way])
+    return "; ".join([", ".join(told) or _tell_nothing(report), *way])
 
 
 def moved_m(item: ChangedObject, objects: tuple[ChangedObject, ...]) -> float:
@@ -71,6 +72,13 @@ def _tell_rock(report: ChangeReport) -> Iterator[str]:
         largest_mm = 1000 * max((item.largest_m for item in regions), key=abs)
         places = "place" if len(regions) == 1 else "places"
         yield f"rock moved at {len(regions)} {places} by up to {abs(largest_mm):.0f} mm"
+
+
+def _tell_nothing(report: ChangeReport) -> str:
+    """Return that no change was found, and how many regions were looked at and withdrawn."""
+    n_withdrawn = 0 if report.regions.is_withdrawn is None else int(report.regions.is_withdrawn.sum())
+    looked = f" in {n_withdrawn} region{'s' if n_withdrawn > 1 else ''} looked at" if n_withdrawn else ""
+    return f"no change found{looked}"
 
 
 def _tell_coverage(coverage: Coverage) -> str:

@@ -166,6 +166,7 @@ def _bag(path: str) -> Iterator[Any]:
             warnings.simplefilter("ignore")
             whole = _as_bag(Path(path), Path(folder))
             with AnyReader([whole], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+                _keep_chunks_at_0(bag)
                 yield bag
     except InputError:
         raise
@@ -174,6 +175,15 @@ def _bag(path: str) -> Iterator[Any]:
             raise
         told = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: not a readable bag: {told[:300]}") from error
+
+
+def _keep_chunks_at_0(bag: Any) -> None:
+    """Let chunks of MCAP that begin at time 0 begin before: rosbags takes them for chunks without messages."""
+    for reader in bag.readers:
+        for file in getattr(getattr(reader, "storage", None), "readers", ()):
+            for place, chunk in enumerate(getattr(file, "chunks", ())):
+                if chunk.message_start_time == 0 and chunk.channel_count:
+                    file.chunks[place] = chunk._replace(message_start_time=-1)
 
 
 _MCAP, _SQLITE = b"\x89MCAP", b"SQLite format 3"

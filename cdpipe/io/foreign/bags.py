@@ -71,6 +71,10 @@ class BagScans:
         stamps: Int64Array = arrays["stamps"]
         if not len(stamps):
             raise InputError(f"{path}: {self._topic}: no cloud can be read from it")
+        n_announced = sum(count for name, _, count in self._topics if name == self._topic)
+        if len(stamps) < n_announced:
+            told = f"{len(stamps)} of {n_announced} clouds can be read: the bag is cut short or damaged: copy it again"
+            warnings.warn(f"{path}: {self._topic}: {told}", InputWarning, stacklevel=2)
         # cloud of the topic that each scan is, scans in the order of their stamps
         self._numbers = self._sort(np.flatnonzero(self._find_returns(arrays["has_returns"] > 0)), stamps)
         stamps = stamps[self._numbers]

@@ -20,6 +20,7 @@ from cdpipe.io.ply import read_ply
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.session_check import check_session
 from cdpipe.model.config import MapConfig
+from tests.cdpipe.io import foreign_files
 from tests.cdpipe.io.foreign_files import (
     START_NS,
     drive,
@@ -135,6 +136,26 @@ def test_an_mcap_without_chunks(tmp_path: Path, has_index: bool) -> None:
     bare = {} if has_index else {"index_types": IndexType.NONE, "use_statistics": False, "use_summary_offsets": False}
     path = write_bag(tmp_path / "a.mcap", MADE, use_chunking=False, **bare)
     assert worst_m(path) < 1e-3
+
+
+def test_an_mcap_that_begins_at_time_0_keeps_all_its_clouds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_reader = pytest.importorskip("mcap.reader").make_reader
+    later = write_bag(tmp_path / "later.mcap", MADE, chunk_size=4096)
+    with closing(later.open("rb")) as file:
+        first_ns = min(message.log_time for *_, message in make_reader(file).iter_messages())
+    monkeypatch.setattr(foreign_files, "START_NS", START_NS - first_ns)
+    path = write_bag(tmp_path / "a.mcap", MADE, chunk_size=4096)
+    assert worst_m(path) < 1e-3
+
+
+def test_clouds_that_are_announced_and_cannot_be_read_are_told(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "ros2", MADE)
+    about = path / "metadata.yaml"
+    text = about.read_text()
+    assert text.count("message_count: 6") == 1
+    about.write_text(text.replace("message_count: 6", "message_count: 9"))
+    with pytest.warns(InputWarning, match="/ouster/points: 6 of 9 clouds can be read: the bag is cut short or damaged"):
+        assert worst_m(path) < 1e-3
 
 
 def shuffle_clouds(db3: Path, order: list[int], repeats: int = 0) -> None:

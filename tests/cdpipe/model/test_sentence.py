@@ -49,14 +49,24 @@ def test_several_moved_objects_say_the_nearest_and_the_farthest_way() -> None:
 @pytest.mark.parametrize(
     ("coverage", "told"),
     [
-        (None, "nothing changed"),
-        (covered(0.0, 12.0, False), "nothing changed; 0 m compared, 12 m not seen"),
-        (covered(0.1, 0.0), "nothing changed; one place compared"),
-        (covered(0.0, 0.0, False), "nothing changed; one place not seen"),
+        (None, "no change found"),
+        (covered(0.0, 12.0, False), "no change found; 0 m compared, 12 m not seen"),
+        (covered(0.1, 0.0), "no change found; one place compared"),
+        (covered(0.0, 0.0, False), "no change found; one place not seen"),
     ],
 )
 def test_without_changes(coverage: Coverage | None, told: str) -> None:
     assert str(replace(EMPTY, coverage=coverage)) == told
+
+
+def test_regions_without_an_object_were_looked_at() -> None:
+    none = np.zeros(3, bool)
+    three = ChangeRegions(np.zeros((3, 3)), 4.5, np.ones(3), np.zeros((3, 2), int), none, np.zeros(0))
+    assert str(replace(EMPTY, regions=three)) == "no change found"
+    two = replace(three, is_withdrawn=np.array([True, True, False]))
+    assert str(replace(EMPTY, regions=two)) == "no change found in 2 regions looked at"
+    one = replace(three, is_withdrawn=np.array([True, False, False]))
+    assert str(replace(EMPTY, regions=one)) == "no change found in 1 region looked at"
 
 
 def test_regions_count_where_there_are_no_objects() -> None:
