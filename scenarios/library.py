@@ -286,7 +286,7 @@ def _path_of(name_or_path: str) -> Path:
         raise ScenarioError(
             f"{visible(str(path))}: no such file; a scenario is a YAML file or a name such as {min(files)}"
         )
-    hint = suggest(name_or_path, files) or f"; known are {', '.join(sorted(files))}"
+    hint = suggest(name_or_path, files) or "; `tunnelcd list scenarios` names all"
     raise ScenarioError(f'scenario "{visible(name_or_path)}": unknown{hint}')
 
 

@@ -182,7 +182,7 @@ def open_run_folder(path: Path) -> RunFolder:
         InputError: There is none, or it holds a link.
     """
     if not path.is_dir():
-        raise InputError(f"{path}: no such run folder")
+        raise InputError(f"{path}: no such run folder: name one that `tunnelcd run PLAN --out RUN` made")
     run = RunFolder(path)
     run.provenance()
     require_no_links(path)

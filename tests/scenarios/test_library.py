@@ -455,7 +455,7 @@ def test_unknown_names_suggest_the_nearest() -> None:
         load_scenario("paper/sit1", 0)
     with pytest.raises(ScenarioError, match=r'did you mean "paper/site2"\?$'):
         load_scenario("site2", 0)
-    with pytest.raises(ScenarioError, match=r'"qqq": unknown; known are .*smoke/one_box'):
+    with pytest.raises(ScenarioError, match=r'"qqq": unknown; `tunnelcd list scenarios` names all'):
         load_scenario("qqq", 0)
     with pytest.raises(ScenarioError, match=r"nowhere.yaml: no such file"):
         load_scenario("nowhere.yaml", 0)

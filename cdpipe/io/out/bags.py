@@ -82,5 +82,10 @@ def _open_mcap(path: Path, messages: RosMessages) -> Iterator[_Write]:
             text, _ = messages.store.generate_msgdef(kind, ros_version=2)
             schema = writer.register_schema(kind, "ros2msg", text.encode())
             channels[topic] = writer.register_channel(topic, "cdr", schema)
-        yield lambda topic, stamp_ns, content: writer.add_message(channels[topic], stamp_ns, content, stamp_ns)
+
+        def write(topic: str, stamp_ns: int, content: bytes) -> None:
+            # some readers take a chunk that begins at time 0 for one without messages
+            writer.add_message(channels[topic], max(stamp_ns, 1), content, max(stamp_ns, 1))
+
+        yield write
         writer.finish()
