@@ -323,3 +323,18 @@ def describe_calls(run: RunFolder, evaluation: EvaluationFile) -> dict[tuple[str
     """Return how the call about each pair of the evaluation ended, by (scenario, seed)."""
     calls = {pair: read_call(run, evaluation.name, *pair) for pair in evaluation.pairs}
     return {pair: call.model_dump(mode="json") for pair, call in calls.items() if call is not None}
+
+
+def require_an_answer(run: RunFolder, name: str) -> None:
+    """Refuse an evaluation in which the command failed on every pair; its rows and calls stay.
+
+    Raises:
+        InputError: How the first call ended, and where all of them are kept.
+    """
+    pairs = read_evaluation(run, name).pairs
+    errors = [call.error if (call := read_call(run, name, *pair)) else "" for pair in pairs]
+    if pairs and all(errors):
+        (world, seed), folder = pairs[0], evaluation_folder(run, name)
+        raise InputError(
+            f"{name}: no pair has an answer; {world} {seed}: {errors[0]}; {folder}/*/SEED.json hold what it said"
+        )

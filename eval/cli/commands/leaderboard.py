@@ -74,7 +74,7 @@ def evaluate(
 ) -> None:
     """Score a program of yours on the pairs of a plan, beside the reference results. Finished pairs are kept."""
     from eval.leaderboard.command import parse_command
-    from eval.leaderboard.evaluation import Method, evaluate_command
+    from eval.leaderboard.evaluation import Method, evaluate_command, require_an_answer
     from eval.leaderboard.reference import find_reference
     from eval.plans.changes import change_plan
     from eval.plans.plan import load_plan
@@ -89,7 +89,10 @@ def evaluate(
         outcome = evaluate_command(chosen, run, method, command=argv, force=force, progress=progress)
     _compare(out, name, committed, quiet=quiet)
     kept = f", {outcome.n_kept} kept from earlier" if outcome.n_kept else ""
-    say(quiet, f"{out}: {count_pairs(outcome.n_done)} answered now{kept}; {outcome.n_failed} of all without an answer")
+    n_pairs = outcome.n_done + outcome.n_kept
+    told = f"{count_pairs(outcome.n_done)} asked now{kept}; {outcome.n_failed} of {n_pairs} without an answer"
+    say(quiet, f"{out}: {told}")
+    require_an_answer(run, name)
 
 
 def _compare(out: Path, name: str, committed: object, *, quiet: bool) -> None:

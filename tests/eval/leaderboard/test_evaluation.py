@@ -14,7 +14,7 @@ from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.io.known_merge import read_alignment, read_known_merge, write_alignment
 from cdpipe.model.alignment import PathAlignment
 from eval.core.terminal.progress import Silent
-from eval.leaderboard.evaluation import evaluation_folder, read_call, read_evaluation
+from eval.leaderboard.evaluation import evaluation_folder, read_call, read_evaluation, require_an_answer
 from eval.leaderboard.given_merge import write_merge
 from eval.leaderboard.submission import pack_submission
 from eval.oracles.merge import OracleMerge, align_by_truth
@@ -88,6 +88,16 @@ def test_a_pair_without_an_answer_is_a_row_with_its_error(evaluator: Evaluator, 
     assert call is not None and said in call.error
     assert str(evaluator.run.path) not in call.error
     assert ("RuntimeError" in call.stderr) == ("RuntimeError" in text)
+    with pytest.raises(InputError, match=f"mine: no pair has an answer; {ONE_BOX} 20000: "):
+        require_an_answer(evaluator.run, "mine")
+
+
+def test_a_command_that_fails_on_one_pair_is_no_mistake(evaluator: Evaluator) -> None:
+    mark = f"mark = Path({str(evaluator.run.path.parent / 'mark')!r})"
+    fails_once = f"import sys\nfrom pathlib import Path\n{mark}\nif not mark.exists(): mark.touch(); sys.exit(1)\n"
+    evaluator.evaluate(fails_once + GOOD)
+    assert sorted(rows_of(evaluator)["status"]) == ["failed", "ok"]
+    require_an_answer(evaluator.run, "mine")
 
 
 def test_finished_pairs_are_kept_until_something_changes(evaluator: Evaluator) -> None:
