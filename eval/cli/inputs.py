@@ -3,6 +3,7 @@
 # ruff: noqa: PLC0415 - heavy imports stand inside the functions, so that --help and completion are instant
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -38,6 +39,15 @@ Metadata = Annotated[
 Deskew = Annotated[
     bool, typer.Option("--deskew/--no-deskew", help="--no-deskew: points that have times are deskewed already")
 ]
+Origin = Annotated[
+    str | None,
+    typer.Option(
+        "--origin",
+        metavar="X,Y,Z",
+        help="metres to subtract from maps and poses in a grid (UTM)",
+        show_default=False,
+    ),
+]
 NONE = "-"
 
 
@@ -50,6 +60,7 @@ def how_to_read(
     metadata: list[str] | None,
     *,
     deskew: bool,
+    origin: str | None = None,
 ) -> list[HowToRead]:
     """Return how to read each of the recordings that a command names.
 
@@ -59,13 +70,30 @@ def how_to_read(
     from cdpipe.io.foreign import HowToRead
 
     HowToRead(odometry=odometry)  # a wrong name is refused, whether or not it is used
-    files = _each("trajectory", trajectories, n_inputs)
+    files, origin_m = _each("trajectory", trajectories, n_inputs), read_metres("origin", origin or "0,0,0")
     if all(files) and odometry is not None:
         HowToRead(odometry=odometry, trajectory=files[0])  # which refuses them together
     return [
-        HowToRead(form, tuple(topics or ()), trajectory, None if trajectory else odometry, beside, deskew)
+        HowToRead(form, tuple(topics or ()), trajectory, None if trajectory else odometry, beside, deskew, origin_m)
         for trajectory, beside in zip(files, _each("metadata", metadata, n_inputs), strict=True)
     ]
+
+
+def read_metres(option: str, text: str) -> tuple[float, float, float]:
+    """Return the three numbers of an option.
+
+    Raises:
+        InputError: They are not three finite numbers.
+    """
+    from cdpipe.core.errors import InputError
+
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not all(map(math.isfinite, (x, y, z))):
+        raise InputError(f"--{option} {text}: expected three numbers in metres, as 12.5,-1.8,0.9")
+    return x, y, z
 
 
 def tell_recordings(

@@ -31,7 +31,8 @@ def require_reachable(where: str, farthest_m: float, cell_m: float, setting: str
     if not farthest_m < max_coordinate_m(cell_m):
         raise InputError(
             f"{where}: positions reach {farthest_m:.0f} m, cells of {setting}{cell_m} m can be numbered up to "
-            f"{max_coordinate_m(cell_m):.0f} m: subtract a common offset from the trajectory"
+            f"{max_coordinate_m(cell_m):.0f} m: subtract a common offset from the trajectory "
+            "(of a recording: --origin X,Y,Z)"
         )
 
 

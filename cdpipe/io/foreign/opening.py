@@ -8,7 +8,7 @@ import tempfile
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,7 @@ class HowToRead:
         odometry: "kiss-icp" or "genz-icp" estimates the poses.
         metadata: The .json of a PCAP's sensor.
         deskew: Whether points that have times are deskewed; False where they are already.
+        origin_m: Metres to subtract from the points of a map and from the positions of poses, as of a map grid (UTM).
     """
 
     format: str | None = None
@@ -57,6 +58,7 @@ class HowToRead:
     odometry: str | None = None
     metadata: Path | None = None
     deskew: bool = True
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if self.format is not None:
@@ -179,7 +181,8 @@ def _open_clouds(path: Path, how: HowToRead) -> Clouds:
             f"{path}: one cloud, a map without its scans, has no poses: leave --trajectory and --odometry out, or name "
             "a folder with one file per scan"
         )
-    return MapStations(path, cloud_reader(name, path)(path))
+    cloud = cloud_reader(name, path)(path)
+    return MapStations(path, replace(cloud, points=cloud.points - np.array(how.origin_m)))
 
 
 def _pose(clouds: Clouds, how: HowToRead, report: Progress) -> _Posed:
@@ -187,6 +190,8 @@ def _pose(clouds: Clouds, how: HowToRead, report: Progress) -> _Posed:
     if how.odometry is not None:
         return _estimate(clouds, how, report)
     trajectory = read_poses(how.trajectory) if how.trajectory is not None else clouds.own
+    if trajectory is not None and not isinstance(clouds, MapStations):
+        trajectory = trajectory.less(how.origin_m)
     if trajectory is None:
         raise InputError(
             f"{clouds.name}: {clouds.lacks}: give --trajectory FILE (poses of the sensor: TUM, KITTI or CSV), "

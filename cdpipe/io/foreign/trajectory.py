@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +56,12 @@ class Trajectory:
     poses: Float64Array
     time_s: Float64Array | None = None
     is_tum: bool = False
+
+    def less(self, origin_m: Sequence[float]) -> Trajectory:
+        """Return the poses with the origin (3,) at these coordinates."""
+        poses = self.poses.copy()
+        poses[:, :3, 3] -= origin_m
+        return replace(self, poses=poses)
 
     def motion(self) -> Motion | None:
         """Return the motion through the poses; None with one pose only, or without times that rise."""

@@ -15,6 +15,7 @@ from eval.cli.inputs import (
     Format,
     Metadata,
     Odometry,
+    Origin,
     Topics,
     Trajectories,
     how_to_read,
@@ -47,6 +48,7 @@ def convert(
     form: Format = None,
     topics: Topics = None,
     deskew: Deskew = True,
+    origin: Origin = None,
     with_truth: Annotated[
         bool, typer.Option("--with-truth/--without-truth", help="the truth of a simulated session leaves, too")
     ] = False,
@@ -70,7 +72,7 @@ def convert(
 
     if len(sources) not in (1, _ANSWER):
         raise InputError(f"{len(sources)} inputs: expected one, or BEFORE AFTER ANSWER, and then the output")
-    hows = how_to_read(min(len(sources), 2), form, topics, trajectory, odometry, metadata, deskew=deskew)
+    hows = how_to_read(min(len(sources), 2), form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin)
     with shown_warnings(), shown_progress(quiet) as progress:
         if len(sources) == _ANSWER:
             _refuse_truth(sources[-1], with_truth)

@@ -16,6 +16,7 @@ from eval.cli.inputs import (
     Format,
     Metadata,
     Odometry,
+    Origin,
     Topics,
     Trajectories,
     how_to_read,
@@ -46,13 +47,14 @@ def describe(
     odometry: Odometry = None,
     metadata: Metadata = None,
     deskew: Deskew = True,
+    origin: Origin = None,
     quiet: Quiet = False,
 ) -> None:
     """Compute a session's descriptors and store them beside it, as a robot would while mapping."""
     import cdpipe
 
     require_method_settings(settings)
-    hows = how_to_read(1, form, topics, trajectory, odometry, metadata, deskew=deskew)
+    hows = how_to_read(1, form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin)
     with shown_warnings(), shown_progress(quiet) as progress:
         (source,) = open_inputs([session], hows, progress)
         descriptors, path = cdpipe.describe(source, preset, settings or ())
@@ -85,6 +87,7 @@ def detect(
     odometry: Odometry = None,
     metadata: Metadata = None,
     deskew: Deskew = True,
+    origin: Origin = None,
     quiet: Quiet = False,
 ) -> None:
     """Find what changed between two sessions, simulated or recorded; needs no truth."""
@@ -97,7 +100,7 @@ def detect(
     settings = [*(["surface.method=planes"] if surface else []), *(settings or [])]
     config = cdpipe.load_config(preset, settings, site)
     known = _read_known_merge(before_T_after, assume_aligned=assume_aligned)
-    hows = how_to_read(2, form, topics, trajectory, odometry, metadata, deskew=deskew)
+    hows = how_to_read(2, form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin)
     try:
         with shown_warnings(), new_folder(out) as partial, shown_progress(quiet) as progress:
             earlier, later = open_inputs([before, after], hows, progress)

@@ -3,18 +3,15 @@
 # ruff: noqa: PLC0415 - heavy imports stand inside the commands, so that --help and completion are instant
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from eval.cli.inputs import read_metres
 from eval.cli.options import KindOfSite, OutFolder, Preset, Quiet, SetSettings
 from eval.core.terminal.printing import LINE, echo, print_table, say, shown_warnings
 from eval.core.terminal.progress import shown_progress
-
-if TYPE_CHECKING:
-    from cdpipe.core.geometry import Float64Array
 
 Story = Annotated[Path, typer.Argument(metavar="STORY", help="folder of `simulate --sessions N`")]
 
@@ -53,10 +50,12 @@ def story_command(
     quiet: Quiet = False,
 ) -> None:
     """Compare session 1 of a story with every later one: displacement of places and props over the sessions."""
+    import numpy as np
+
     from eval.stories import write_story_page
     from eval.stories.comparisons import Method, run_comparisons
 
-    given = [_read_place(text) for text in at or ()]
+    given = [np.array(read_metres("at", text)) for text in at or ()]
     method = Method(preset, site, ("surface.method=planes", *(settings or ())))
     with shown_warnings(), shown_progress(quiet, rate="sessions") as progress:
         comparisons = run_comparisons(story, out, method, progress, with_truth=with_truth)
@@ -66,17 +65,3 @@ def story_command(
     elif not quiet:
         print_table("displacement since session 1, mm, and 95 % level of detection", moved, LINE)
     echo(f"page: {out / 'index.html'}")
-
-
-def _read_place(text: str) -> Float64Array:
-    import numpy as np
-
-    from cdpipe.core.errors import InputError
-
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
-        raise InputError(f"--at {text}: expected three numbers in metres, as 12.5,-1.8,0.9")
-    return np.array(numbers)

@@ -16,6 +16,7 @@ from eval.cli.inputs import (
     Format,
     Metadata,
     Odometry,
+    Origin,
     Topics,
     Trajectories,
     how_to_read,
@@ -68,6 +69,7 @@ def view(
     odometry: Odometry = None,
     metadata: Metadata = None,
     deskew: Deskew = True,
+    origin: Origin = None,
     quiet: Quiet = False,
 ) -> None:
     """Show a world, a pair, a session, a recording, or what an answer found between two of them, in the browser."""
@@ -76,7 +78,9 @@ def view(
     if html is not None and not html.absolute().parent.is_dir():
         raise InputError(f"--html {html}: there is no folder {html.parent}: make it, or name another one")
     asked = join_world_settings(world, settings)
-    hows = how_to_read(1 if after is None else 2, form, topics, trajectory, odometry, metadata, deskew=deskew)
+    hows = how_to_read(
+        1 if after is None else 2, form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin
+    )
     with _sessions_at_hand([Path(what), *([] if after is None else [after])], quiet):
         if after is not None:
             _view_answer(_require_answer(what, after, answer, seed, asked), hows, port, host, html, quiet)

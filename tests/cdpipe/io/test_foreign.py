@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 pytest.importorskip("pypcd4", reason="pip install 'tunnelcd[formats]'")
 pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
@@ -101,6 +102,16 @@ def test_a_trajectory_at_another_rate_is_interpolated(tmp_path: Path) -> None:
     assert "the scans have none (add times.txt" in said(folder, HowToRead(trajectory=tmp_path / "t.tum"))
     kitti = write_trajectory(tmp_path / "k.txt", MADE.stamps_s, "kitti")
     assert worst_m(folder, HowToRead(trajectory=kitti)) > 0.3  # poses without times cannot deskew
+
+
+def test_an_origin_is_subtracted_from_poses_alone(tmp_path: Path) -> None:
+    folder = write_pcds(tmp_path / "run", MADE, "binary")
+    far_m = np.array([432_000.0, 5_411_000.0, 300.0])
+    poses = odom_T_sensor(MADE.stamps_s)
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    stamps = START_NS / 1e9 + MADE.stamps_s
+    np.savetxt(tmp_path / "t.tum", np.column_stack([stamps, poses[:, :3, 3] + far_m, turns]), fmt="%.9f")
+    assert worst_m(folder, HowToRead(trajectory=tmp_path / "t.tum", origin_m=(432_000.0, 5_411_000.0, 300.0))) < 0.01
 
 
 def test_quaternions_with_w_first_are_noticed(tmp_path: Path) -> None:

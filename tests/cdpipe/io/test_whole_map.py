@@ -9,7 +9,8 @@ import pytest
 
 from cdpipe import detect
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array, stream
+from cdpipe.core.geometry import Float64Array, stream, transform
+from cdpipe.io.foreign import HowToRead
 from cdpipe.io.foreign.whole_map import find_stations
 from cdpipe.io.ply import write_ply_points
 from cdpipe.io.readers import open_session
@@ -96,8 +97,13 @@ def test_a_map_without_a_floor_is_refused(tmp_path: Path, points: Float64Array) 
 
 def test_a_map_in_the_coordinates_of_a_country_is_refused_with_the_offset_to_subtract(tmp_path: Path) -> None:
     points = drift(1)[:2_000] + np.array([432_010.0, 5_411_020.0, 320.0])
-    with pytest.raises(InputError, match=r"map grid \(UTM\)\? Subtract \(432000, 5411000, 0\) metres from"):
-        open_session(write(tmp_path / "utm.ply", points))
+    path = write(tmp_path / "utm.ply", points)
+    with pytest.raises(InputError, match=r"map grid \(UTM\)\? Subtract an origin.*: --origin 432000,5411000,0"):
+        open_session(path)
+    near = list(open_session(path, HowToRead(origin_m=(432_000.0, 5_411_000.0, 0.0))).scans())
+    found = np.concatenate([transform(scan.odom_T_sensor, scan.points_sensor) for scan in near])
+    stored = points.astype(np.float32).astype(np.float64) - (432_000.0, 5_411_000.0, 0.0)
+    np.testing.assert_allclose(found[np.lexsort(found.T)], stored[np.lexsort(stored.T)], atol=1e-6)
 
 
 def test_a_map_of_another_unit_or_with_lost_points_is_refused_on_one_line(tmp_path: Path) -> None:
