@@ -14,6 +14,7 @@ from cdpipe.model.config import preset_files, setting_fields
 from cdpipe.sensor.ouster import describe_profile, profile_names
 from eval.graft.adapters import list_adapters
 from eval.plans.files import plan_files, read_plan
+from eval.tables.columns import RESULT_COLUMNS
 from scenarios import prop_names
 from scenarios.catalogue import describe_prop, family_files
 
@@ -111,6 +112,12 @@ def _recordings() -> Iterable[Entry]:
         yield Entry(name, "; ".join([*told, *(["cannot be grafted"] if adapter.unreadable else [])]))
 
 
+def _metrics() -> Iterable[Entry]:
+    """Yield the main columns of results.csv, and the metrics of plugins."""
+    yield from (Entry(column.key, _one_line(column.meaning)) for column in RESULT_COLUMNS)
+    yield from (Entry(name, describe_entry_point(METRICS, name)) for name in entry_points(METRICS))
+
+
 def _one_line(text: object) -> str:
     """Return the first sentence of a text on one line."""
     words = " ".join(str(text or "").split())
@@ -124,7 +131,7 @@ _LISTED: dict[str, Callable[[], Iterable[Entry]]] = {
     "plans": _plans,
     "presets": _presets,
     "methods": lambda: (Entry(name, describe_method(name)) for name in entry_points(METHODS)),
-    "metrics": lambda: (Entry(name, describe_entry_point(METRICS, name)) for name in entry_points(METRICS)),
+    "metrics": _metrics,
     "sensors": lambda: (Entry(name, _one_line(describe_profile(name))) for name in profile_names()),
     "recordings": _recordings,
     "settings": _settings,

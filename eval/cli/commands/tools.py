@@ -186,7 +186,7 @@ _TITLES = {
     "plans": "plans",
     "presets": "presets",
     "methods": "methods",
-    "metrics": "metrics of plugins",
+    "metrics": "metrics",
     "sensors": "sensor profiles",
     "recordings": "public recordings",
 }

@@ -65,11 +65,12 @@ def test_each_prop_and_method_has_a_line_of_its_own(command: Command, kind: str)
     assert all(20 < len(row["description"]) < 120 for row in rows)
 
 
-@pytest.mark.parametrize("kind", ["presets", "sensors"])
-def test_presets_and_sensors_are_described(command: Command, kind: str) -> None:
+@pytest.mark.parametrize("kind", ["presets", "sensors", "metrics"])
+def test_presets_sensors_and_metrics_are_described(command: Command, kind: str) -> None:
     rows = json.loads(command("list", kind, "--json")[1])
     assert all(row["description"] for row in rows)
-    assert rows[0]["name"] == {"presets": "c2c", "sensors": "os0-128-nominal"}[kind]
+    first = {"presets": "c2c", "sensors": "os0-128-nominal", "metrics": "region_recall"}
+    assert rows[0]["name"] == first[kind]
 
 
 def test_all_names_as_json(command: Command) -> None:
