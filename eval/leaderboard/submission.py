@@ -41,7 +41,7 @@ _MANIFEST = "submission.json"
 _HEAD = _MANIFEST.encode()  # the name of the first member stands near the start of the file
 _FILES = ("answer.json", "answer.npz")
 _MOST_BYTES = 4 << 30
-_EXPECTED = "expected a file of `tunnelcd submit`: ask for it again"
+_EXPECTED = "expected a file that `tunnelcd submit DIR --out FILE.zip` makes"
 _TOLD = 3
 _ROUNDING = 1e-6
 # columns of a row that say who answered what, which scoring does not know

@@ -31,6 +31,8 @@ def read_plan(name_or_path: str) -> Document:
         InputError: It is unknown, or no YAML.
     """
     if name_or_path.endswith((".yaml", ".yml")):
+        if not Path(name_or_path).exists():
+            raise InputError(f"{name_or_path}: no such file: expected a plan, or a name of `tunnelcd list plans`")
         return _resolve_files(read_yaml(Path(name_or_path)), Path(name_or_path).parent)
     plans = plan_files()
     if name_or_path not in plans:

@@ -565,3 +565,8 @@ def test_surface_is_a_section_of_the_method_and_a_list_of_the_world() -> None:
         require_draws("narrow", ("surface.method=planes",))
     with pytest.raises(ValueError, match="belongs to the world"):
         require_valid_setting("tunnel.meander_m=1")
+
+
+def test_a_plan_file_that_is_not_there_says_what_was_expected(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"gone\.yaml: no such file: expected a plan, or a name of `tunnelcd list"):
+        load_plan(str(tmp_path / "gone.yaml"))
