@@ -12,6 +12,13 @@ if TYPE_CHECKING:
     from cdpipe.model.report import ChangeReport
 
 
+# the seconds of an answer in the order of the stages
+_STAGES = {
+    "t_descriptor_s": "descriptors", "t_index_s": "indexing", "t_merge_s": "merge", "t_refine_s": "refinement",
+    "t_cd_s": "regions", "t_oe_s": "objects", "t_returns_s": "of it returns", "t_surface_s": "rock",
+}  # fmt: skip
+
+
 def print_answer(report: ChangeReport, out: Path, files: Sequence[str], threshold: float) -> None:
     """Print the regions, the objects and the rock of an answer, its files in `out`, and the sentence about it."""
     from eval.report.answer.tables import (  # noqa: PLC0415 - --help and completion are instant
@@ -35,7 +42,8 @@ def print_answer(report: ChangeReport, out: Path, files: Sequence[str], threshol
     print_table("objects", tabulate_objects(report), LINE)
     if report.surface is not None:
         print_table("rock that moved, mm (positive: into the void)", tabulate_rock(report.surface), LINE)
-    times = ", ".join(f"{name[2:-2]} {seconds:.3f} s" for name, seconds in report.seconds.items())
+    names = [name for name in dict.fromkeys([*_STAGES, *report.seconds]) if name in report.seconds]
+    times = ", ".join(f"{_STAGES.get(name, name)} {report.seconds[name]:.3f} s" for name in names)
     echo_wrapped(f"times: {times}", LINE)
     echo_wrapped(f"{out}: {', '.join(files)}", LINE)
     echo(str(report))

@@ -54,6 +54,8 @@ def test_detect_fits_a_terminal_and_ends_with_the_sentence(
     lines = printed.splitlines()
     assert max(map(len, lines)) <= 80
     assert SENTENCE.fullmatch(lines[-1])
+    stages = re.findall(r"(\w+(?: \w+)*) [\d.]+ s", " ".join(lines).partition("times: ")[2])
+    assert stages == ["descriptors", "indexing", "merge", "refinement", "regions", "objects", "of it returns"]
     report = read_answer(out).report
     assert report is not None
     assert lines[-1].startswith(f"{len(report.objects)} added")
