@@ -22,6 +22,7 @@ from eval.tables.merge_table import ALL_FAMILIES
 from eval.tables.rows import ALL_DOMAINS, is_told_the_truth, numbers, records
 
 _MOST_NAMES = 3
+_NEXT_SETTING = re.compile(r",(?=[a-z0-9_.-]+=)")
 _FIRST_SETTING = re.compile(r"(?P<preset>[^\[]+)\[(?P<key>[^=,\]]+)=(?P<value>[^,\]]+)[,\]]")
 _TOO_LITTLE = "The run holds too little to compare two methods."
 _SUBJECT = "change detection between two LiDAR sessions of a tunnel"
@@ -104,17 +105,33 @@ def name_by_setting(variants: Iterable[str]) -> tuple[str, dict[str, str]]:
     return found[0]["key"], dict(zip(names, values, strict=True))
 
 
+def name_without_shared(variants: Iterable[str]) -> tuple[str, dict[str, str]]:
+    """Return the settings that all of some variants share, and each variant without them; "" and nothing if none."""
+    settings = {name: _NEXT_SETTING.split(name.partition("[")[2].removesuffix("]")) for name in variants}
+    shared = set.intersection(*map(set, settings.values())) - {""} if len(settings) > 1 else set[str]()
+    if not shared:
+        return "", {}
+    own = {name: ",".join(each for each in found if each not in shared) for name, found in settings.items()}
+    found = {name: name.partition("[")[0] + (f"[{rest}]" if rest else "") for name, rest in own.items()}
+    return ", ".join(each for each in next(iter(settings.values())) if each in shared), found
+
+
 def _told(table: pd.DataFrame, column: Column) -> str:
     """Return who leads in every domain of a table, by one of its columns."""
     names = table["variant"].astype(str)
-    setting, values = name_by_setting(names[~names.map(is_told_the_truth)])
+    fair = names[~names.map(is_told_the_truth)]
+    setting, values = name_by_setting(fair)
+    by = f" by {setting}" if setting else ""
+    if not setting:
+        shared, values = name_without_shared(fair)
+        by = f" with {shared}" if shared else ""
     parts = []
     for domain, own in table.assign(variant=names.replace(values)).groupby("domain", sort=False):
         if domain == ALL_DOMAINS and table["domain"].nunique() > 1:
             continue
         leaders = name_leaders(zip(own["variant"], numbers(own, column.key), strict=True), column)
         parts += [f"{domain_name(str(domain))}: {leaders}"] if leaders else []
-    extreme, by = "Highest" if column.better == "high" else "Lowest", f" by {setting}" if setting else ""
+    extreme = "Highest" if column.better == "high" else "Lowest"
     return f"{extreme} {column.heading}{by}, {'; '.join(parts)}." if parts else ""
 
 

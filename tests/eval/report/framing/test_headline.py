@@ -6,7 +6,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from eval.report.framing.headline import name_by_setting, name_leaders, write_answer, write_title
+from eval.report.framing.headline import name_by_setting, name_leaders, name_without_shared, write_answer, write_title
 from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
 from eval.tables.columns import Column, share
@@ -78,6 +78,32 @@ def test_each_domain_has_its_leaders(tmp_path: Path) -> None:
 )
 def test_variants_of_one_setting(variants: tuple[str, ...], told: tuple[str, dict[str, str]]) -> None:
     assert name_by_setting(variants) == told
+
+
+@pytest.mark.parametrize(
+    ("variants", "told"),
+    [
+        (("m[a.b=x]", "n[a.b=x]"), ("a.b=x", {"m[a.b=x]": "m", "n[a.b=x]": "n"})),
+        (
+            ("m[a.b=[1, 2],c.d=y]", "m[a.b=[1, 2]]"),
+            ("a.b=[1, 2]", {"m[a.b=[1, 2],c.d=y]": "m[c.d=y]", "m[a.b=[1, 2]]": "m"}),
+        ),
+        (("m[a.b=x]", "n"), ("", {})),
+        (("m", "n"), ("", {})),
+        (("m[a.b=x]",), ("", {})),
+    ],
+)
+def test_variants_without_the_settings_that_they_share(
+    variants: tuple[str, ...], told: tuple[str, dict[str, str]]
+) -> None:
+    assert name_without_shared(variants) == told
+
+
+def test_leaders_are_named_without_the_settings_that_all_share(tmp_path: Path) -> None:
+    values = {"m[a.b=x]": 0.9, "n[a.b=x]": 0.5, "oracle-merge[a.b=x]": 1.0}
+    rows = [{"scenario": "narrow", "variant": name, "region_recall": value} for name, value in values.items()]
+    told = write_answer(run(tmp_path, rows), pd.DataFrame())
+    assert told == "Highest region recall with a.b=x, in distribution: m (0.90), before n (0.50)."
 
 
 def test_leaders_that_differ_by_a_setting_are_named_by_it(tmp_path: Path) -> None:
