@@ -98,7 +98,7 @@ def _suggest_offset(points: Float64Array) -> str:
     middle = np.median(points, axis=0)
     if np.abs(points - middle).max() > _SITE_M or np.abs(middle).max() < _SITE_M:
         return ""
-    offset = ",".join(f"{value:.0f}" for value in np.round(middle, -3))
+    offset = ",".join(f"{value:.0f}" for value in np.round(middle, -3) + 0.0)
     return f"coordinates of a map grid (UTM)? Subtract an origin from both maps: --origin {offset}"
 
 

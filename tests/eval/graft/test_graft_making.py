@@ -132,7 +132,7 @@ def test_the_command_line(simulated: Path, tmp_path: Path, command: Command) -> 
     code, out, _ = command("graft", simulated / "before", "--objects", props, *told, tmp_path / "pair")
     assert code == 0
     assert "every other revolution of one recording" in out
-    assert "1 changes, 1 observable" in out
+    assert "1 change, 1 observable" in out
     assert command("score", tmp_path / "pair", tmp_path)[0] == 2  # there is no answer; the pair itself is read
     code, out, _ = command("graft", simulated / "before", "--out", tmp_path / "null")
     assert (code, "a real pair without changes" in out) == (0, True)
