@@ -88,7 +88,7 @@ def quaternion(pose: Float64Array) -> Float64Array:
 @lru_cache(maxsize=512)
 def _remember_quaternion(rotation: bytes) -> tuple[float, ...]:
     """Return the quaternion of a matrix (3, 3) of float64: most solids of a prop share their rotation with others."""
-    matrix = np.frombuffer(rotation).reshape(3, 3)
+    matrix = np.frombuffer(rotation).reshape(3, 3).copy()  # scipy's lowest version takes no read-only one
     return tuple(Rotation.from_matrix(matrix).as_quat(scalar_first=True).tolist())
 
 
