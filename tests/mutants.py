@@ -114,14 +114,17 @@ def report_results(
     listed = {mutant for mutant in alive if mutant in single or any(equal.explains(mutant) for equal in everywhere)}
     wrong = [f"survives and is not listed in {LIST.name}:\n  {mutant}" for mutant in sorted(alive - listed)]
     wrong += [f"not run:\n  {mutant}" for mutant, code in results if code is _NOT_RUN]
-    rows = ["| file | mutants | dead | alive, listed | alive, not listed | dead [%] |", "|---|---|---|---|---|---|"]
+    rows = ["| file | mutants | not run | dead | alive, listed | alive, not listed | dead of those run [%] |"]
+    rows.append("|---|---|---|---|---|---|---|")
     for file in [*sorted({mutant.file for mutant, _ in results}), "all"]:
         own = [mutant for mutant, _ in results if file in ("all", mutant.file)]
         living = [mutant for mutant in own if mutant in alive]
-        n_dead, n_listed = len(own) - len(living), sum(mutant in listed for mutant in living)
-        cells = [file, len(own), n_dead, n_listed, len(living) - n_listed, f"{100 * n_dead / len(own):.1f}"]
+        n_idle = sum(code is _NOT_RUN for mutant, code in results if file in ("all", mutant.file))
+        n_dead, n_listed = len(own) - len(living) - n_idle, sum(mutant in listed for mutant in living)
+        share = f"{100 * n_dead / (len(own) - n_idle):.1f}" if len(own) > n_idle else "-"
+        cells = [file, len(own), n_idle, n_dead, n_listed, len(living) - n_listed, share]
         rows.append(f"| {' | '.join(map(str, cells))} |")
-    if n_dead < LEAST_DEAD * len(results):
+    if n_dead < LEAST_DEAD * (len(results) - n_idle):
         wrong.append(f"{n_dead} of {len(results)} mutants are dead: at least {LEAST_DEAD:.0%} must be")
     return "\n".join(rows), wrong
 

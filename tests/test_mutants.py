@@ -60,12 +60,24 @@ def test_the_table_by_hand() -> None:
     results += [(Mutant("b.py", "f", str(number), ""), 1) for number in range(10)]
     table, wrong = report_results([*results, (FIRST, 0), (SECOND, 33)], [], [FIRST])
     assert table.splitlines()[2:] == [
-        "| a.py | 20 | 18 | 1 | 1 | 90.0 |",
-        "| b.py | 10 | 10 | 0 | 0 | 100.0 |",
-        "| all | 30 | 28 | 1 | 1 | 93.3 |",
+        "| a.py | 20 | 0 | 18 | 1 | 1 | 90.0 |",
+        "| b.py | 10 | 0 | 10 | 0 | 0 | 100.0 |",
+        "| all | 30 | 0 | 28 | 1 | 1 | 93.3 |",
     ]
     assert len(wrong) == 1 and str(SECOND) in wrong[0] and "not listed" in wrong[0]
     assert report_results([*results, (FIRST, 0), (SECOND, 1)], [], [FIRST])[1] == []
+
+
+def test_what_has_not_run_is_not_dead() -> None:
+    results = [(Mutant("a.py", "f", str(number), ""), 1) for number in range(24)]
+    idle = [(Mutant("b.py", "f", str(number), ""), None) for number in range(5)]
+    table, wrong = report_results([*results, (FIRST, 0), *idle], [], [FIRST])
+    assert table.splitlines()[2:] == [
+        "| a.py | 25 | 0 | 24 | 1 | 0 | 96.0 |",
+        "| b.py | 5 | 5 | 0 | 0 | 0 | - |",
+        "| all | 30 | 5 | 24 | 1 | 0 | 96.0 |",
+    ]
+    assert len(wrong) == 5 and all("not run" in each for each in wrong)
 
 
 @pytest.mark.parametrize(
