@@ -41,7 +41,8 @@ def draw_hardness(data: RunData) -> Hardness | None:
 
 def _with_texts(table: pd.DataFrame) -> pd.DataFrame:
     """Return a table with "" where a unit or a value is empty."""
-    return table.astype({"unit": object, "value": object}).fillna({"unit": "", "value": ""})
+    texts = {name: table[name].astype(object).where(table[name].notna(), "") for name in ("unit", "value")}
+    return table.assign(**texts)
 
 
 def _ranked(points: pd.DataFrame) -> list[str]:

@@ -98,7 +98,7 @@ def follow_places(comparisons: Sequence[Comparison], places: Sequence[ChosenPlac
             rows.append({**told, **_measure(surface, place.point_map), "true_m": _true_m(true, surface, place)})
     table = pd.DataFrame(rows, columns=list(COLUMNS))
     order = {place.name: index for index, place in enumerate(places)}
-    table = table.sort_values(["place", "session"], key=lambda column: column.replace(order), kind="stable")
+    table = table.iloc[np.lexsort((table["session"], table["place"].map(order)))]
     for name in order:
         own = table[table["place"] == name]
         is_seen = (own["n_points"] > 0) | own["true_m"].notna()

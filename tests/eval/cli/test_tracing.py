@@ -21,7 +21,9 @@ def run(capsys: pytest.CaptureFixture[str], *argv: object) -> tuple[int, str, st
 
 def save_drift(path: Path, scale: float = 1.0) -> Path:
     """Write a closed drift along x, 4 m wide and 3 m high, in 1 / scale metres."""
-    solid = trimesh.creation.box(extents=(30.0, 4.0, 3.0)).subdivide_to_size(1.0)
+    solid = trimesh.creation.box(extents=(30.0, 4.0, 3.0))
+    for _ in range(5):  # edges of 1 m; subdivide_to_size leaves cracks in old versions
+        solid = solid.subdivide()
     solid.apply_translation((15.0, 0.0, 1.5))
     solid.invert()
     solid.apply_scale(scale)

@@ -24,7 +24,9 @@ LENGTH_M, RISE_M = 30.0, 2.6
 
 def arched(rise_m: float) -> trimesh.Trimesh:
     """A drift along x, 4 m wide and 3 m high, whose floor rises in the middle like a parabola."""
-    solid = trimesh.creation.box(extents=(LENGTH_M + 8, 4.0, 3.0)).subdivide_to_size(0.6)
+    solid = trimesh.creation.box(extents=(LENGTH_M + 8, 4.0, 3.0))
+    for _ in range(6):  # edges of 0.6 m; subdivide_to_size leaves cracks in old versions
+        solid = solid.subdivide()
     solid.apply_translation((LENGTH_M / 2, 0.0, 1.5))
     share = 2 * solid.vertices[:, 0] / LENGTH_M - 1
     solid.vertices[:, 2] += rise_m * (1 - share**2)
