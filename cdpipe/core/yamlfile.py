@@ -252,6 +252,8 @@ def _describe_mistake(model: type[BaseModel], document: Document, error: Any) ->
     expected = error.get("ctx", {}).get("expected")
     if error["type"] == "literal_error" and isinstance(error["input"], str):
         hint = suggest(error["input"], [word.strip(" '\"") for word in expected.replace(" or ", ",").split(",")])
+    if error["type"] == "literal_error" and key[-1:] == ("format_version",) and type(error["input"]) is int:
+        hint = "; it is of a newer tunnelcd: update tunnelcd" if error["input"] > 1 else ""
     rule = _OF_YAML.get(error["type"], error["msg"].removeprefix("Value error, "))
     rule = rule[0].lower() + rule[1:] if not rule[:2].isupper() else rule
     return f"{where}: {name} = {_brief(error['input'])}: {rule}{hint}" if name else f"{where}: {rule}{hint}"

@@ -58,10 +58,7 @@ def describe_setting(entry: Entry, columns: int) -> list[str]:
 
 
 def _scenarios() -> Iterable[Entry]:
-    return (
-        Entry(name, _one_line(read_yaml(path).get("description")))
-        for name, path in sorted(family_files().items())
-    )
+    return (Entry(name, _one_line(read_yaml(path).get("description"))) for name, path in sorted(family_files().items()))
 
 
 def _plans() -> Iterable[Entry]:

@@ -113,9 +113,9 @@ def make_search_path(folder: Path) -> None:
 
 
 def read_search_path(folder: Path) -> None:
-    """List all, and read each by its name."""
+    """List them, and read each by its name."""
     with on_search_path(folder):
-        for kind in ("presets", "plans", "scenarios"):
+        for kind in ("presets", "plans"):  # of scenarios there are 150
             list_entries(kind)
         load_config("my_own")
         load_plan("my_own")

@@ -44,9 +44,7 @@ def _preset() -> Path:
 
 @pytest.mark.parametrize("spoil", SPOILED)
 @pytest.mark.parametrize("kind", READERS)
-def test_what_is_no_yaml_is_one_line(
-    kind: str, spoil: Spoil, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_yaml_is_one_line(kind: str, spoil: Spoil, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / kind).mkdir()
     spoil(tmp_path / kind / "my_own.yaml")
     monkeypatch.setenv(SEARCH_PATH, str(tmp_path))
@@ -56,9 +54,7 @@ def test_what_is_no_yaml_is_one_line(
 
 
 @pytest.mark.parametrize("content", ["", "[a, b]\n", "word\n"])
-def test_a_file_without_keys_has_no_description(
-    content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_without_keys_has_no_description(content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for kind in ("plans", "families", "families/dust"):
         (tmp_path / kind).mkdir()
         (tmp_path / kind / "my_own.yaml").write_text(content)
