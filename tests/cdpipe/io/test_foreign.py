@@ -6,6 +6,7 @@ import os
 import shutil
 import sqlite3
 import sys
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -417,3 +418,14 @@ def test_a_pipe_in_the_place_of_a_bag_is_not_waited_for(name: str, tmp_path: Pat
     path = tmp_path / name.partition("/")[0]
     with pytest.raises(InputError, match="it is a device or a pipe"):
         open_session(path, HowToRead(format="bag"))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no pipes in folders")
+@pytest.mark.parametrize(("write", "name"), [(write_pcds, "pcd"), (write_lases, "las")])
+def test_a_pipe_in_the_place_of_a_scan_is_not_waited_for(write: Callable[..., Path], name: str, tmp_path: Path) -> None:
+    folder = write(tmp_path / "run", MADE)
+    scan = sorted(path for path in folder.iterdir() if path.suffix in (".pcd", ".las", ".laz"))[1]
+    scan.unlink()
+    os.mkfifo(scan)
+    write_trajectory(tmp_path / "poses.txt", MADE.stamps_s)
+    assert "it is a device or a pipe" in said(folder, HowToRead(format=name, trajectory=tmp_path / "poses.txt"))
