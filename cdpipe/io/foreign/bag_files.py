@@ -194,9 +194,9 @@ _LIBRARIES = ("rosbags", "sqlite3", "zstandard", "lz4", "ruamel", "struct")
 def _as_bag(path: Path, folder: Path) -> Path:
     """Return what rosbags opens: the file of a ROS 1 bag, or a folder with metadata.yaml, made for a lone file."""
     if path.is_dir():
-        for file in path.iterdir():
-            if not file.is_dir():
-                require_plain_file(file)
+        for each in path.iterdir():
+            if not each.is_dir():
+                require_plain_file(each)
         if (path / "metadata.yaml").is_file():
             return path
         files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3", ".bag"))
