@@ -76,7 +76,7 @@ def clean_family(name: str) -> str | None:
     """
     if name.partition("/")[0] not in EFFECT_GROUPS or name not in family_files():
         return None
-    base = read_yaml(family_files()[name]).value.get("extends")
+    base = read_yaml(family_files()[name]).get("extends")
     return base if base in family_files() else None
 
 

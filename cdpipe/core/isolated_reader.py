@@ -261,13 +261,13 @@ def serve() -> None:
 
 def _answer(request: Mapping[str, Any], send: Callable[[str, Any, Arrays], None]) -> None:
     try:
-        _limit_time(request["cpu_s"])
+        limit_time(request["cpu_s"])
         module = import_module(request["module"])
-        _limit_memory()
+        limit_memory(MEMORY_BYTES + (os.cpu_count() or 1) * _MEMORY_BYTES_PER_CORE, _MAX_WRITTEN_BYTES)
         messages: Iterable[Message] = getattr(module, request["function"])(**request["arguments"])
         for value, arrays in messages:
             send("message", value, arrays)
-            _limit_time(request["cpu_s"])
+            limit_time(request["cpu_s"])
     except InputError as error:
         send("mistake", str(error), {})
     except MemoryError:
@@ -289,7 +289,7 @@ def _write(answer: BinaryIO, kind: str, value: Any, arrays: Arrays) -> None:
             at += answer.write(part[at:])
 
 
-def _limit_time(cpu_s: float) -> None:
+def limit_time(cpu_s: float) -> None:
     """Let the process use `cpu_s` more seconds of CPU time; the kernel ends it with SIGXCPU after that."""
     if sys.platform == "win32":
         return
@@ -298,8 +298,8 @@ def _limit_time(cpu_s: float) -> None:
     _limit(resource.RLIMIT_CPU, math.ceil(usage.ru_utime + usage.ru_stime + cpu_s), hard_s)
 
 
-def _limit_memory() -> None:
-    """Let the process take `MEMORY_BYTES` more, and write neither a large file nor a core dump.
+def limit_memory(most_bytes: int, most_written_bytes: int | None = None) -> None:
+    """Let the process take so many bytes more, and write neither a larger file nor a core dump.
 
     RLIMIT_DATA counts what is private and writable, which is what a parser allocates. RLIMIT_AS would also count the
     shared libraries, the file where a library maps it, and the address space that the heap of each thread reserves:
@@ -309,8 +309,9 @@ def _limit_memory() -> None:
         return
     statm = Path("/proc/self/statm")
     held = int(statm.read_text().split()[5]) * resource.getpagesize() if statm.exists() else 0
-    _limit(resource.RLIMIT_DATA, held + MEMORY_BYTES + (os.cpu_count() or 1) * _MEMORY_BYTES_PER_CORE)
-    _limit(resource.RLIMIT_FSIZE, _MAX_WRITTEN_BYTES)
+    _limit(resource.RLIMIT_DATA, held + most_bytes)
+    if most_written_bytes is not None:
+        _limit(resource.RLIMIT_FSIZE, most_written_bytes)
     _limit(resource.RLIMIT_CORE, 0)
 
 

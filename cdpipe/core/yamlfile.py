@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -76,6 +77,10 @@ class Document:
             key = key[:-1]
         return self.origins.get(key, self.source)
 
+    def get(self, name: str) -> Any:
+        """Return the value of a key of the outermost level; None where there is none, or no keys at all."""
+        return self.value.get(name) if isinstance(self.value, dict) else None
+
 
 def read_yaml(path: Path, text: str | None = None) -> Document:
     """Parse a YAML file (or `text` under that name).
@@ -101,6 +106,19 @@ def _parse(path: str, text: str) -> Document:
     if parsed.mistakes:
         raise InputError("\n".join(f"{path}:{line}: {visible(told)}" for line, told in parsed.mistakes[:_MAX_TOLD]))
     return Document(path, parsed.value, {key: f"{path}:{line}" for key, line in parsed.lines.items()})
+
+
+def read_yaml_text(file: Traversable) -> str:
+    """Return the text of a YAML file that `find_yaml` found: of this package, of a plugin, or on the search path.
+
+    Raises:
+        InputError: It is no plain file, too large, or not UTF-8.
+    """
+    try:
+        content = read_bytes(file, MAX_YAML_BYTES) if isinstance(file, Path) else file.read_bytes()
+        return content.decode()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file}: not YAML: {error}") from error
 
 
 def validate(model: type[ModelT], document: Document) -> ModelT:
@@ -246,6 +264,8 @@ def _describe_mistake(model: type[BaseModel], document: Document, error: Any) ->
     expected = error.get("ctx", {}).get("expected")
     if error["type"] == "literal_error" and isinstance(error["input"], str):
         hint = suggest(error["input"], [word.strip(" '\"") for word in expected.replace(" or ", ",").split(",")])
+    if error["type"] == "literal_error" and key[-1:] == ("format_version",) and type(error["input"]) is int:
+        hint = "; it is of a newer tunnelcd: update tunnelcd" if error["input"] > 1 else ""
     rule = _OF_YAML.get(error["type"], error["msg"].removeprefix("Value error, "))
     rule = rule[0].lower() + rule[1:] if not rule[:2].isupper() else rule
     return f"{where}: {name} = {_brief(error['input'])}: {rule}{hint}" if name else f"{where}: {rule}{hint}"

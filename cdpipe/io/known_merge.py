@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import parse_json, read_bytes
+from cdpipe.core.files import parse_json, read_bytes, require_format
 from cdpipe.core.geometry import Float64Array, make_pose
 from cdpipe.model.alignment import PathAlignment
 
+FORMAT, FORMAT_VERSION = "tunnelcd-merge", 1
 _EXPECTED = "expected a 4x4 rigid transform, four lines of four numbers or JSON"
 _MOST_BYTES = 100_000_000  # an answer.json is one, too
 # Largest difference of an entry from the nearest rotation's: files are rounded to six digits.
@@ -29,11 +30,11 @@ def read_known_merge(path: Path) -> Float64Array:
     """Read a (4, 4) `before_T_after`: four lines of numbers, JSON, or JSON that has it by that name, as answers do.
 
     Raises:
-        InputError: The file is missing, or holds no rigid transform.
+        InputError: The file is missing, of a newer format, or holds no rigid transform.
     """
     content = read_bytes(path, _MOST_BYTES, _EXPECTED)
     try:
-        return require_rigid(_parse(content))
+        return require_rigid(_matrix_of(_parse(path, content)))
     except (ValueError, TypeError, OverflowError) as error:
         raise InputError(f"{path}: {error}: {_EXPECTED}") from error
 
@@ -42,13 +43,13 @@ def read_alignment(path: Path) -> PathAlignment:
     """Read a merge along the path, as `write_alignment` writes it; a file of one transform gives a rigid one.
 
     Raises:
-        InputError: The file is missing, or holds no rigid transforms.
+        InputError: The file is missing, of a newer format, or holds no rigid transforms.
     """
     content = read_bytes(path, _MOST_BYTES, _EXPECTED)
     try:
-        document = _parse_document(content)
+        document = _parse(path, content)
         if not isinstance(document, dict) or "anchors_odom" not in document:
-            return PathAlignment.rigid(require_rigid(_parse(content)))
+            return PathAlignment.rigid(require_rigid(_matrix_of(document)))
         anchors = np.asarray(document["anchors_odom"], dtype=np.float64)
         if not np.isfinite(anchors).all():
             raise ValueError("anchors_odom is not finite")
@@ -67,7 +68,7 @@ def write_alignment(path: Path, before_T_after: Float64Array, along: PathAlignme
         along: The transforms along the path.
         source: What made the merge.
     """
-    document = {"format": "tunnelcd-merge", "format_version": 1, "source": source}
+    document = {"format": FORMAT, "format_version": FORMAT_VERSION, "source": source}
     document |= {"before_T_after": before_T_after.tolist(), "anchors_odom": along.anchors_odom.tolist()}
     document |= {"before_T_after_at_anchors": along.before_T_after.tolist()}
     path.write_text(json.dumps(document))
@@ -92,13 +93,16 @@ def require_rigid(matrix: Any) -> Float64Array:
     return make_pose(rotation, matrix[:3, 3])
 
 
-def _parse(content: bytes) -> Any:
-    value = _parse_document(content)
+def _matrix_of(value: Any) -> Any:
     return value.get("before_T_after") if isinstance(value, dict) else value
 
 
-def _parse_document(content: bytes) -> Any:
+def _parse(path: Path, content: bytes) -> Any:
     text = content.decode()
-    if text.lstrip()[:1] in ("[", "{"):
-        return parse_json(content)
-    return [[float(word) for word in line.split()] for line in text.splitlines() if line.strip()]
+    if text.lstrip()[:1] not in ("[", "{"):
+        return [[float(word) for word in line.split()] for line in text.splitlines() if line.strip()]
+    document = parse_json(content)
+    if isinstance(document, dict) and document.get("format") == FORMAT:
+        found = FORMAT, document.get("format_version", FORMAT_VERSION)
+        require_format(path, found, FORMAT, FORMAT_VERSION, "write it again")
+    return document

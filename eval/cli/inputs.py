@@ -49,6 +49,7 @@ Origin = Annotated[
     ),
 ]
 NONE = "-"
+_FARTHEST_M = 1e8  # as poses may lie
 
 
 def how_to_read(
@@ -83,7 +84,7 @@ def read_metres(option: str, text: str) -> tuple[float, float, float]:
     """Return the three numbers of an option.
 
     Raises:
-        InputError: They are not three finite numbers.
+        InputError: They are not three numbers within 100,000 km.
     """
     from cdpipe.core.errors import InputError
 
@@ -91,7 +92,7 @@ def read_metres(option: str, text: str) -> tuple[float, float, float]:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
         x = y = z = math.nan
-    if not all(map(math.isfinite, (x, y, z))):
+    if not all(abs(value) <= _FARTHEST_M for value in (x, y, z)):
         raise InputError(f"--{option} {text}: expected three numbers in metres, as 12.5,-1.8,0.9")
     return x, y, z
 

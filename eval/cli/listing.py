@@ -8,7 +8,7 @@ from textwrap import shorten, wrap
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 from cdpipe.core.plugins import METHODS, METRICS, describe_entry_point, entry_points
-from cdpipe.core.yamlfile import read_yaml
+from cdpipe.core.yamlfile import read_yaml, read_yaml_text
 from cdpipe.methods.registry import describe_method
 from cdpipe.model.config import preset_files, setting_fields
 from cdpipe.sensor.ouster import describe_profile, profile_names
@@ -58,21 +58,18 @@ def describe_setting(entry: Entry, columns: int) -> list[str]:
 
 
 def _scenarios() -> Iterable[Entry]:
-    return (
-        Entry(name, _one_line(read_yaml(path).value.get("description")))
-        for name, path in sorted(family_files().items())
-    )
+    return (Entry(name, _one_line(read_yaml(path).get("description"))) for name, path in sorted(family_files().items()))
 
 
 def _plans() -> Iterable[Entry]:
-    return (Entry(name, _one_line(read_plan(name).value.get("description"))) for name in plan_files())
+    return (Entry(name, _one_line(read_plan(name).get("description"))) for name in plan_files())
 
 
 def _presets() -> Iterable[Entry]:
     """Yield the presets; the comment at the head of the file describes one, up to its first full stop."""
     for name, file in preset_files().items():
         head = []
-        for line in file.read_text(encoding="utf-8").splitlines():
+        for line in read_yaml_text(file).splitlines():
             if not line.startswith("#"):
                 break
             head.append(line.lstrip("# "))

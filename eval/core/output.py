@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import shutil
 import tempfile
@@ -11,10 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.names import path_part, visible
+from cdpipe.core.names import visible
+from cdpipe.core.whole_file import partial_of
+from cdpipe.core.whole_file import whole_file as whole_file  # noqa: PLC0414 - it is one of the functions of this module
 
 _HEAD_BYTES = 1024
-_LONGEST_BYTES = 255  # of a name, which file systems take
 
 
 @contextmanager
@@ -31,7 +31,7 @@ def new_folder(path: Path) -> Iterator[Path]:
         path = Path(os.path.realpath(path)) if path.is_symlink() else path.absolute()
         if path.is_symlink():
             raise InputError(f"{path}: is a link that leads to itself: name a folder you may write to")
-        hidden = _partial_of(path)
+        hidden = partial_of(path)
         made = _missing_parents(path)
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             what = "is not empty" if path.is_dir() else "is a file"
@@ -56,25 +56,6 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a hidden path that becomes `path` when the block succeeds, and is removed when it fails.
-
-    Raises:
-        OSError: The path is a folder, or nothing can be written there.
-    """
-    if path.is_dir() and not path.is_symlink():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    partial = _partial_of(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.unlink(missing_ok=True)  # it may be a link, which a writer would follow
-        yield partial
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-@contextmanager
 def new_files(*paths: Path) -> Iterator[Path]:
     """Yield a hidden empty folder whose files of these names become `paths` when the block succeeds.
 
@@ -95,7 +76,7 @@ def new_files(*paths: Path) -> Iterator[Path]:
         partial: Path | None = None
         try:
             try:
-                partial = _partial_of(first)
+                partial = partial_of(first)
                 _start(partial)
             except OSError as error:
                 raise unwritable(first, error) from error
@@ -218,18 +199,6 @@ def remove(path: Path) -> None:
 def unwritable(path: Path, error: OSError) -> InputError:
     """Return the error that says why an output folder cannot be used."""
     return InputError(f"{path}: cannot write there ({error.strerror}): name a folder you may write to")
-
-
-def _partial_of(path: Path) -> Path:
-    """Return the hidden name beside a path under which it is written first; of a long name it holds a part.
-
-    Raises:
-        OSError: The path's own name is too long.
-    """
-    if len(os.fsencode(path.name)) > _LONGEST_BYTES:
-        raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(path))
-    name = f".{path.name}.partial"
-    return path.with_name(name if len(os.fsencode(name)) <= _LONGEST_BYTES else f".{path_part(path.name)}.partial")
 
 
 def _start(partial: Path) -> None:

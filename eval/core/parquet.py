@@ -10,7 +10,6 @@ from __future__ import annotations
 import importlib.util
 import os
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,6 +18,8 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import require_plain_file
+from cdpipe.core.isolated_reader import limit_memory, limit_time
 from cdpipe.core.isolation import ProcessDiedError, run_isolated
 from cdpipe.core.names import path_part
 from eval.core.output import new_folder
@@ -26,8 +27,8 @@ from eval.core.output import new_folder
 MIN_ROWS = 100_000
 """Tables with fewer rows have no Parquet: a reader of CSV is fast enough."""
 PART_ROWS = 1_000_000
-_MAX_MEMORY = 16 << 30
-_MAX_CPU_S = 3600
+_MIN_MEMORY, _MEMORY_RATIO = 512 << 20, 10  # of the process that reads, beside the size of the Parquet
+_MIN_CPU_S, _BYTES_PER_CPU_S = 8, 200_000
 _MAX_RATIO = 200  # of a table's CSV to its Parquet
 _SMALL_BYTES = 64_000_000
 
@@ -70,10 +71,10 @@ def read_parquet(folder: Path, most_bytes: int | None = None) -> bytes:
     if importlib.util.find_spec("pyarrow") is None:
         raise InputError(f"{folder}: Parquet needs a package more: pip install 'tunnelcd[parquet]'")
     parts = sorted(folder.glob("*.parquet"))
-    n_bytes = sum(part.stat().st_size for part in parts)
+    n_bytes = sum(require_plain_file(part) for part in parts)
     with TemporaryDirectory(prefix="tunnelcd-") as scratch:
         out = Path(scratch, "table.csv")
-        asked: dict[str, Any] = {"parts": [str(part.resolve()) for part in parts], "out": str(out)}
+        asked: dict[str, Any] = {"parts": [str(part.resolve()) for part in parts], "out": str(out), "n_bytes": n_bytes}
         asked |= {"most_bytes": _SMALL_BYTES + _MAX_RATIO * n_bytes if most_bytes is None else most_bytes}
         try:
             run_isolated(write_csv_of_parts, asked)
@@ -90,9 +91,11 @@ def write_csv_of_parts(asked: dict[str, Any]) -> None:
     Raises:
         InputError: They are no parts of one table, or hold more than they may.
     """
-    _limit_process()
+    os.environ["ARROW_DEFAULT_MEMORY_POOL"] = "system"
     from pyarrow import parquet  # noqa: PLC0415 - an extra
 
+    limit_time(_MIN_CPU_S + asked["n_bytes"] // _BYTES_PER_CPU_S)
+    limit_memory(_MIN_MEMORY + _MEMORY_RATIO * asked["n_bytes"])
     names: list[str] = []
     with Path(asked["out"]).open("w", newline="") as file:
         for part in asked["parts"]:
@@ -119,12 +122,3 @@ def _parts(frame: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     for _, of_world in frame.groupby((worlds != worlds.shift()).cumsum(), sort=False):
         world = str(of_world["scenario"].iloc[0])
         yield from ((world, of_world[first : first + PART_ROWS]) for first in range(0, len(of_world), PART_ROWS))
-
-
-def _limit_process() -> None:
-    if sys.platform != "win32":
-        import resource  # noqa: PLC0415 - not on Windows
-
-        resource.setrlimit(resource.RLIMIT_AS, (_MAX_MEMORY, _MAX_MEMORY))
-        resource.setrlimit(resource.RLIMIT_CPU, (_MAX_CPU_S, _MAX_CPU_S))
-        os.environ["ARROW_DEFAULT_MEMORY_POOL"] = "system"

@@ -19,6 +19,10 @@ from eval.core.parquet import parquet_folder, read_parquet, write_parquet
 # xz shrinks a constant column ten thousandfold: what a file may expand to is bounded by its own size.
 _SMALL_BYTES = 64_000_000
 _MAX_RATIO = 60
+# What the parser of pandas takes for a cell, and what all cells may take, beside a multiple of the file's size; a cell
+# of a CSV has two bytes at least, one of a packed table next to none.
+_CELL_BYTES, _MIN_CELLS_BYTES, _CELLS_RATIO, _PACKED_CELLS_RATIO = 25, 400_000_000, 10, 100
+_MOST_COLUMNS = 10_000
 
 
 def table_file(path: Path) -> Path:
@@ -60,9 +64,12 @@ def read_table(path: Path) -> pd.DataFrame:
         content = read_parquet(path)
     else:
         content = read_bytes(path, expected="expected a table written by `tunnelcd`")
+    most_bytes = _MIN_CELLS_BYTES + _CELLS_RATIO * len(content)
     try:
         if path.suffix == ".xz":
+            most_bytes = _MIN_CELLS_BYTES + _PACKED_CELLS_RATIO * len(content)
             content = _decompress(content)
+        _check_cells(content, most_bytes)
         table = pd.read_csv(io.BytesIO(content), low_memory=False)
     except pd.errors.EmptyDataError:
         return pd.DataFrame()
@@ -72,6 +79,15 @@ def read_table(path: Path) -> pd.DataFrame:
     if not isinstance(table.index, pd.RangeIndex):  # pandas makes an index of the first cells of such rows
         raise InputError(f"{path}: cannot be read as a table: rows have more cells than the header")
     return table
+
+
+def _check_cells(content: bytes, most_bytes: int) -> None:
+    """Raise ValueError where a table has more cells than there may be memory for, or more columns than any of ours."""
+    n_cells, n_columns = content.count(b",") + content.count(b"\n"), 1 + content.partition(b"\n")[0].count(b",")
+    if _CELL_BYTES * n_cells > most_bytes:
+        raise ValueError(f"{n_cells} cells, more than {most_bytes // _CELL_BYTES}")
+    if n_columns > _MOST_COLUMNS:
+        raise ValueError(f"{n_columns} columns, more than {_MOST_COLUMNS}")
 
 
 def _decompress(content: bytes) -> bytes:

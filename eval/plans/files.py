@@ -11,7 +11,7 @@ from typing import Any
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import YamlError, parse_yaml_value
 from cdpipe.core.plugins import find_yaml
-from cdpipe.core.yamlfile import Document, read_yaml, suggest
+from cdpipe.core.yamlfile import Document, read_yaml, read_yaml_text, suggest
 from cdpipe.model.config import WEIGHTS
 from eval.plans.worlds import format_setting
 
@@ -41,7 +41,7 @@ def read_plan(name_or_path: str) -> Document:
         raise InputError(
             f"plan {name_or_path!r} is unknown{near} (known: {', '.join(plans)}, or the path of a .yaml file)"
         )
-    document = read_yaml(Path(f"{name_or_path}.yaml"), plans[name_or_path].read_text(encoding="utf-8"))
+    document = read_yaml(Path(f"{name_or_path}.yaml"), read_yaml_text(plans[name_or_path]))
     return _resolve_files(document, Path(str(plans[name_or_path])).parent)
 
 

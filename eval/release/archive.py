@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import list_members, read_member, require_plain_file
+from cdpipe.core.files import list_members, read_bytes, read_member, require_plain_file
 from cdpipe.core.names import LONGEST, visible
 from eval.core.output import copy_folder, new_folder, whole_file
 from eval.core.terminal.progress import RunProgress, Silent
@@ -61,7 +61,7 @@ def read_sums(folder: Path) -> dict[str, str]:
     Raises:
         InputError: A line of it is malformed.
     """
-    return _parse_sums((folder / SUMS).read_bytes(), str(folder / SUMS))
+    return _parse_sums(read_bytes(folder / SUMS), str(folder / SUMS))
 
 
 def pack(folder: Path, file: Path, progress: RunProgress | None = None) -> None:

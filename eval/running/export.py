@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import read_json
+from cdpipe.core.files import read_bytes, read_json
 from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.io.session import SessionWriter, read_session
 from eval.core.output import copy_folder, make_writable, new_folder
@@ -85,7 +85,7 @@ def export_with_truth(run: RunFolder, out: Path, progress: RunProgress | None = 
     _require_own(run, out, {pair.parent.name for pair in names.values()})
     for name, pair in names.items():
         there = out / name / _CHANGES
-        if there.is_file() and there.read_bytes() != (pair / _CHANGES).read_bytes():
+        if there.is_file() and read_bytes(there) != read_bytes(pair / _CHANGES):
             raise InputError(f"{out / name}: an earlier simulation of this pair: name a new folder")
     return _export(out, names, copy_folder, progress or Silent())
 
@@ -176,7 +176,7 @@ def _stored_salt(run: RunFolder) -> str | None:
 
 def _opaque_name(salt: str, pair: Path) -> str:
     """Return a keyed digest of a pair's place in its run and of its changes: another simulation has another name."""
-    content = f"{pair.parent.name}/{pair.name}\n".encode() + (pair / _CHANGES).read_bytes()
+    content = f"{pair.parent.name}/{pair.name}\n".encode() + read_bytes(pair / _CHANGES)
     return hashlib.blake2b(content, key=bytes.fromhex(salt), digest_size=8).hexdigest()
 
 

@@ -31,17 +31,27 @@ def main(
 ) -> None:
     """Write the tables of several runs as Markdown."""
     tables = [(path, read_json(path, "a table of `tunnelcd bench --out`")) for path in files]
+    try:
+        parts = _format_tables(tables)
+    except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
+        told = f"{type(error).__name__} {' '.join(str(error).split()):.100}"
+        raise InputError(f"{', '.join(map(str, files))}: damaged tables ({told}): name files of --out") from error
+    try:
+        with whole_file(out) as partial:
+            partial.write_text("\n".join(parts), encoding="utf-8")
+    except OSError as error:
+        raise unwritable(out, error) from error
+
+
+def _format_tables(tables: Sequence[tuple[Path, dict[str, Any]]]) -> list[str]:
+    """Return the parts of the page; of a table that is damaged, whatever that provokes."""
     speed = [table for path, table in tables if not _is_growth(path, table)]
     growth = [table for path, table in tables if _is_growth(path, table)]
     parts = [tell_machine(table) for _, table in tables[:1]]
     if speed:
         parts += [f"Speed, {len(speed)} runs:\n", format_markdown(unite_runs([table["rows"] for table in speed]))]
     parts += [f"Growth:\n\n{format_markdown(list_growth(table['rows']))}" for table in growth]
-    try:
-        with whole_file(out) as partial:
-            partial.write_text("\n".join(parts), encoding="utf-8")
-    except OSError as error:
-        raise unwritable(out, error) from error
+    return parts
 
 
 def tell_machine(table: Mapping[str, Any]) -> str:

@@ -17,6 +17,7 @@ from cdpipe.core.errors import InputError, TunnelcdError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.core.isolation import ProcessDiedError, run_isolated
 from cdpipe.core.progress import Progress, report_nothing
+from cdpipe.core.whole_file import whole_file
 from scenarios.library import load_scenario
 from sim.drive.trajectory import load_sensor, plan_trajectory
 from sim.geometry.raycast import Caster
@@ -273,7 +274,8 @@ def write_csv(path: Path, surveys: Sequence[Survey]) -> None:
     ]
     names = list(dict.fromkeys(name for row in rows for name in row))
     try:
-        with path.open("w", newline="", encoding="utf-8") as file:
+        path.parent.stat()  # a new folder is not made
+        with whole_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, [*(name for name in names if name != "failure"), "failure"])
             writer.writeheader()
             writer.writerows(rows)

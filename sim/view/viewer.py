@@ -16,6 +16,7 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import visible
+from cdpipe.core.whole_file import whole_file
 from sim.view.returns import CHANGE_RGB, SESSION_RGB
 from sim.view.view import ROCK_AFTER, ROCK_BEFORE, Play, View
 
@@ -95,7 +96,9 @@ def write_html(view: View, file: Path, legend: str = "") -> None:
         text = f"{before}{legend}{end}{after}"
     text = text.replace("<title>Viser</title>", f"<title>{html.escape(view.title)}</title>", 1)
     try:
-        file.write_text(text, encoding="utf-8")
+        file.parent.stat()  # a new folder is not made
+        with whole_file(file) as partial:
+            partial.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{file}: cannot be written: {error.strerror}") from error
 

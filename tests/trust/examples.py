@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -10,6 +13,7 @@ import numpy as np
 import pandas as pd
 import trimesh
 
+from cdpipe.core.plugins import SEARCH_PATH
 from cdpipe.descriptors.change_network import load_change_network
 from cdpipe.descriptors.network import load_network
 from cdpipe.descriptors.sphere_network import load_sphere_network
@@ -17,10 +21,13 @@ from cdpipe.descriptors.weights_file import read_weights
 from cdpipe.io.out.answer_map import gather_answer_map
 from cdpipe.io.ply import write_ply_points
 from cdpipe.io.readers import open_session
+from cdpipe.model.config import load_config
+from eval.cli.listing import list_entries
 from eval.core.tablefile import read_table
 from eval.leaderboard.evaluation import describe_calls, evaluation_folder, read_evaluation
 from eval.leaderboard.reference import find_reference
 from eval.leaderboard.submission import pack_submission
+from eval.plans.plan import load_plan
 from eval.release.content import load_release
 from eval.report.answer.content import read_content
 from eval.report.answer.page import render_answer_page
@@ -29,6 +36,7 @@ from eval.report.framing.kept import read_kept
 from eval.running.runfolder import open_run_folder, write_json
 from eval.running.scaling.merging import merge_runs
 from eval.running.scaling.mirror import Mirror
+from eval.studies.bench_tables import main as write_bench_tables
 from scenarios.library import check_scenario, load_grafted, load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import MeshFile
@@ -68,7 +76,9 @@ def make_objects(folder: Path) -> None:
     """Write props for a recording, and a world that names its recording."""
     (folder / "r").mkdir()
     (folder / "r" / "x").write_text("x")
-    props = "props:\n  - {name: box, kind: box, size_m: [{uniform: [0.6, 0.9]}, 0.6, 0.7], change: added}\n"
+    props = "props:\n  - {name: box, kind: box, size_m: [{uniform: [0.6, 0.9]}, 0.6, 0.7], change: added}\nsurface:\n"
+    props += "  - {name: low, kind: heave, depth_m: 0.05, area_m2: 2.0, place: {at: [1.0, 0.0, -1.0]}}\n"
+    props += "  - {name: lined, kind: shotcrete, thickness_m: {uniform: [0.03, 0.08]}, length_m: 3.0, width_m: 2.0}\n"
     (folder / "objects.yaml").write_text(props)
     (folder / "real.yaml").write_text("recording: {sessions: [r], split: halves}\n" + props)
 
@@ -77,6 +87,49 @@ def read_objects(folder: Path) -> None:
     """Draw both."""
     load_grafted(str(folder / "objects.yaml"), {"sessions": [str(folder / "r")]}, 3)
     check_scenario(str(folder / "real.yaml"))
+
+
+def make_bench_tables(folder: Path) -> None:
+    """Copy two tables of `bench`."""
+    for name in ("bench-1", "growth"):
+        shutil.copy(_ROOT / "reports" / "bench" / f"{name}.json", folder)
+
+
+def read_bench_tables(folder: Path) -> None:
+    """Write them as one page."""
+    write_bench_tables([folder / "bench-1.json", folder / "growth.json"], folder / "tables.md")
+
+
+def make_search_path(folder: Path) -> None:
+    """Write a preset, a plan and a family of one's own."""
+    copied = {
+        "presets": "cdpipe/methods/presets/voxel-diff",
+        "plans": "eval/plans/shipped/smoke",
+        "families": "scenarios/families/smoke/one_box",
+    }
+    for kind, name in copied.items():
+        (folder / kind).mkdir()
+        shutil.copy(_ROOT / f"{name}.yaml", folder / kind / "my_own.yaml")
+
+
+def read_search_path(folder: Path) -> None:
+    """List them, and read each by its name."""
+    with on_search_path(folder):
+        for kind in ("presets", "plans"):  # of scenarios there are 150
+            list_entries(kind)
+        load_config("my_own")
+        load_plan("my_own")
+        load_scenario("my_own", 3)
+
+
+@contextmanager
+def on_search_path(folder: Path) -> Iterator[None]:
+    """Have a folder on the search path."""
+    os.environ[SEARCH_PATH] = str(folder)
+    try:
+        yield
+    finally:
+        del os.environ[SEARCH_PATH]
 
 
 def make_weights(folder: Path) -> None:

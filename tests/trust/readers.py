@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import json
 import lzma
-import os
 import shutil
 import struct
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,6 @@ import numpy as np
 import trimesh
 
 from cdpipe.core.geometry import invert, make_pose, yaw_pose
-from cdpipe.core.plugins import SEARCH_PATH
 from cdpipe.core.yamlfile import apply_settings, read_yaml, setting_lines
 from cdpipe.descriptors.describe import load_descriptors, save_descriptors
 from cdpipe.io.answer import read_answer
@@ -263,18 +260,9 @@ def _props(folder: Path) -> None:
 
 
 def _read_props(folder: Path) -> None:
-    with _search_path(folder):
+    with examples.on_search_path(folder):
         prop = read_prop("my_skip")
     prop_mesh(prop.mesh, "skip")
-
-
-@contextmanager
-def _search_path(folder: Path) -> Iterator[None]:
-    os.environ[SEARCH_PATH] = str(folder)
-    try:
-        yield
-    finally:
-        del os.environ[SEARCH_PATH]
 
 
 def _descriptors(folder: Path) -> None:
@@ -637,6 +625,8 @@ READERS: tuple[Reader, ...] = (
     Reader("MCAP", _foreign("write_bag", ".mcap"), _read_foreign, ("r.mcap",), 0.1, extra="mcap"),
     Reader("worlds that move", examples.make_worlds, examples.read_worlds, ("*.yaml",), 0.2, lines=True),
     Reader("props to graft", examples.make_objects, examples.read_objects, ("*.yaml",), 0.5, lines=True),
+    Reader("files on the search path", examples.make_search_path, examples.read_search_path, ("*/*",), 0.3, lines=True),
+    Reader("tables of bench", examples.make_bench_tables, examples.read_bench_tables, ("*.json",), 1.0),
     Reader("weights", examples.make_weights, examples.read_all_weights, ("*",), 0.3),
     Reader("united runs", _union, examples.read_union, _UNION, 0.1, lines=True),
     Reader("evaluated method", examples.make_evaluation, examples.read_evaluated, _EVALUATED, 0.3, lines=True),

@@ -10,20 +10,28 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from pydantic import BaseModel
 from safetensors.numpy import save as save_arrays
 from torch import Tensor, nn
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_tensors
 from cdpipe.core.geometry import make_pose
+from cdpipe.core.yamlfile import Document, validate
 from cdpipe.descriptors.sphere_network import load_sphere_network, make_untrained_sphere_network
 from cdpipe.descriptors.weights_file import checkpoint_bytes, numbered_checkpoint_bytes
 from cdpipe.io.answer import read_answer
+from cdpipe.io.answer_parts import AnswerPart
+from cdpipe.io.known_merge import read_alignment, read_known_merge, write_alignment
 from cdpipe.io.session import ScanChunk, SessionWriter, chunk_path, read_session
+from cdpipe.model.alignment import PathAlignment
 from cdpipe.sensor.ouster import parse_metadata
 from cdpipe.training.fit import FitConfig, fit
 from cdpipe.training.shard import FIELDS, encode_shard, read_shard
+from eval.leaderboard.evaluation import CallFile, EvaluationFile
+from eval.leaderboard.submission import Submission
 from eval.running.runfolder import RunFolder, open_run_folder, write_json
+from eval.running.scaling.keeping import Dropped
 from sim.session.truth import read_pair_truth
 
 NEWER = "it is of a newer tunnelcd: update tunnelcd"
@@ -242,3 +250,23 @@ def test_a_shard_of_another_format_is_named(tmp_path: Path) -> None:
         path.write_bytes(_renumbered(content, version))
         with pytest.raises(InputError, match=told):
             read_shard(path)
+
+
+@pytest.mark.parametrize("model", [AnswerPart, Submission, EvaluationFile, CallFile, Dropped])
+def test_documents_of_a_newer_format_say_so(model: type[BaseModel]) -> None:
+    for version, told in ((2, f"; {NEWER}"), (0, "")):
+        with pytest.raises(InputError) as error:
+            validate(model, Document("a.json", {"format_version": version}))
+        (line,) = (line for line in str(error.value).split("\n") if line.startswith("a.json: format_version ="))
+        assert line.endswith(f"input should be 1{told}")
+
+
+def test_a_known_merge_of_a_newer_format_is_refused(tmp_path: Path) -> None:
+    path, identity = tmp_path / "merge.json", np.eye(4)
+    write_alignment(path, identity, PathAlignment(np.zeros((1, 3)), identity[None]), "truth")
+    np.testing.assert_array_equal(read_known_merge(path), identity)
+    assert len(read_alignment(path).before_T_after) == 1
+    _change(path, format_version=2)
+    for read in (read_known_merge, read_alignment):
+        with pytest.raises(InputError, match=NEWER):
+            read(path)

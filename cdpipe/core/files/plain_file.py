@@ -42,7 +42,7 @@ def read_bytes(path: Path, most_bytes: int | None = None, expected: str = "") ->
     """Return the content of a file.
 
     Raises:
-        InputError: As `require_plain_file`, or the file cannot be read.
+        InputError: As `require_plain_file`, or the file cannot be read, or not be held in memory.
     """
     n_bytes = require_plain_file(path, most_bytes, expected)
     try:
@@ -50,3 +50,5 @@ def read_bytes(path: Path, most_bytes: int | None = None, expected: str = "") ->
             return file.read(n_bytes)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}){f': {expected}' if expected else ''}") from error
+    except MemoryError as error:
+        raise InputError(f"{path}: {n_bytes / 1e9:.1f} GB, more than there is memory for") from error

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.files import require_plain_file
 from cdpipe.core.isolated_reader import Message
 from cdpipe.io.foreign.clouds import INTENSITY_FIELDS, TIME_FIELDS, field_of
 
@@ -193,12 +194,16 @@ _LIBRARIES = ("rosbags", "sqlite3", "zstandard", "lz4", "ruamel", "struct")
 def _as_bag(path: Path, folder: Path) -> Path:
     """Return what rosbags opens: the file of a ROS 1 bag, or a folder with metadata.yaml, made for a lone file."""
     if path.is_dir():
+        for each in path.iterdir():
+            if not each.is_dir():
+                require_plain_file(each)
         if (path / "metadata.yaml").is_file():
             return path
         files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3", ".bag"))
         if len(files) != 1:
             raise ValueError(f"{len(files)} files without a metadata.yaml: name one of them")
         path = files[0]
+    require_plain_file(path)
     with path.open("rb") as file:
         head = file.read(16)
     if head.startswith(b"#ROSBAG"):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import read_bytes
+from cdpipe.core.files import read_bytes, require_plain_file
 from cdpipe.core.isolated_reader import IsolatedReader, Message
 from cdpipe.core.plugins import require_extra
 from cdpipe.io.foreign.clouds import INTENSITY_FIELDS, TIME_FIELDS, Cloud, check_cloud, field_of
@@ -167,6 +167,7 @@ def read_e57(path: str, index: int) -> Iterator[Message]:
 
 @contextmanager
 def _reads(path: str, what: str) -> Iterator[None]:
+    require_plain_file(Path(path))
     try:
         yield
     except InputError:

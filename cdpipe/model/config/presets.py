@@ -11,7 +11,16 @@ from typing import Any, Literal
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.plugins import PRESETS, find_yaml
-from cdpipe.core.yamlfile import Document, apply_settings, read_yaml, setting_lines, split_section, suggest, validate
+from cdpipe.core.yamlfile import (
+    Document,
+    apply_settings,
+    read_yaml,
+    read_yaml_text,
+    setting_lines,
+    split_section,
+    suggest,
+    validate,
+)
 from cdpipe.model.config.pipeline import PipelineConfig
 
 Site = Literal["narrow", "wide"]
@@ -69,7 +78,7 @@ def _preset_document(preset: str) -> Document:
     presets = preset_files()
     if preset not in presets:
         raise InputError(f"preset {preset!r} is unknown{suggest(preset, presets)} (known: {', '.join(presets)})")
-    document = read_yaml(Path(f"{preset}.yaml"), presets[preset].read_text(encoding="utf-8"))
+    document = read_yaml(Path(f"{preset}.yaml"), read_yaml_text(presets[preset]))
     return _resolve_files(document, Path(str(presets[preset])).parent)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources.abc import Traversable
 
+from cdpipe.core.yamlfile import read_yaml_text
 from cdpipe.model.config import preset_files
 from eval.running.results.grids import split_variant
 from eval.tables.columns import Column, spaced
@@ -71,7 +72,7 @@ def index_entries(methods: Sequence[Entry], columns: Sequence[Entry], variants: 
 def head_comment(file: Traversable) -> str:
     """Return the comment at the head of a file on one line, "" where there is none."""
     head = []
-    for line in file.read_text(encoding="utf-8").splitlines():
+    for line in read_yaml_text(file).splitlines():
         if not line.startswith("#"):
             break
         head.append(line.lstrip("# "))

@@ -80,7 +80,7 @@ def measure(
         path = out / "rows" / f"{world_slug(family)}-{seed}.json"
         key = _key(scenario, seed, settings)
         document = read_json(path)
-        if document.get("key") != key or "rows" not in document:
+        if document.get("key") != key or not _are_rows(document.get("rows")):
             pair = out / "pairs" / path.stem
             try:
                 if not pair.exists():
@@ -97,6 +97,11 @@ def measure(
         rows += document["rows"]
     progress.cells("done", len(todo), len(todo))
     return pd.DataFrame(rows)
+
+
+def _are_rows(rows: Any) -> bool:
+    """Tell whether stored rows are rows; others are measured again."""
+    return isinstance(rows, list) and all(isinstance(row, dict) for row in rows)
 
 
 def _key(scenario: Scenario, seed: int, settings: Sequence[str]) -> str:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
+import sys
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -403,3 +406,26 @@ def test_the_unit_of_angles_is_that_of_the_header(tmp_path: Path) -> None:
     assert yaw_rad("", 90.0) == pytest.approx(np.pi / 2)
     with pytest.warns(InputWarning, match="are taken for radians"):
         assert yaw_rad("", 0.5) == pytest.approx(0.5)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no pipes in folders")
+@pytest.mark.parametrize("name", ["r.mcap", "r/r.mcap", "r/r_0.db3"])
+def test_a_pipe_in_the_place_of_a_bag_is_not_waited_for(name: str, tmp_path: Path) -> None:
+    (tmp_path / "r").mkdir()
+    os.mkfifo(tmp_path / name)
+    if name.endswith(".db3"):
+        (tmp_path / "r" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+    path = tmp_path / name.partition("/")[0]
+    with pytest.raises(InputError, match="it is a device or a pipe"):
+        open_session(path, HowToRead(format="bag"))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no pipes in folders")
+@pytest.mark.parametrize(("write", "name"), [(write_pcds, "pcd"), (write_lases, "las")])
+def test_a_pipe_in_the_place_of_a_scan_is_not_waited_for(write: Callable[..., Path], name: str, tmp_path: Path) -> None:
+    folder = write(tmp_path / "run", MADE)
+    scan = sorted(path for path in folder.iterdir() if path.suffix in (".pcd", ".las", ".laz"))[1]
+    scan.unlink()
+    os.mkfifo(scan)
+    write_trajectory(tmp_path / "poses.txt", MADE.stamps_s)
+    assert "it is a device or a pipe" in said(folder, HowToRead(format=name, trajectory=tmp_path / "poses.txt"))

@@ -9,7 +9,9 @@ import pytest
 pytest.importorskip("pypcd4", reason="pip install 'tunnelcd[formats]'")
 pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
 
+from cdpipe.core.errors import InputError
 from cdpipe.io.readers import open_session
+from eval.cli.inputs import read_metres
 from tests.cdpipe.io.foreign_files import drive, write_bag, write_pcds, write_trajectory
 from tests.eval.cli.test_converting import Command, refused
 
@@ -63,3 +65,10 @@ def test_descriptors_of_other_options_are_stored_apart(tmp_path: Path, command: 
     assert default.parent.parent == folder
     assert other.parent.parent.parent == folder
     assert default.read_bytes() != other.read_bytes()
+
+
+@pytest.mark.parametrize("text", ["1,2", "nan,0,0", "1e400,0,0", "0,0,1.1e8", "a,b,c"])
+def test_an_origin_is_three_metres_within_what_poses_may_have(text: str) -> None:
+    assert read_metres("origin", "432010.5,-5.4e6,320") == (432010.5, -5.4e6, 320.0)
+    with pytest.raises(InputError, match=rf"^--origin {text}: expected three numbers in metres"):
+        read_metres("origin", text)

@@ -1,6 +1,7 @@
 import errno
 import os
 import shutil
+import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -140,3 +141,18 @@ def test_nothing_is_left_when_the_start_is_interrupted(
     with pytest.raises(KeyboardInterrupt), write(tmp_path / "a" / "b"):
         pass
     assert tree(tmp_path) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no pipes in folders")
+@pytest.mark.parametrize("is_linked", [False, True])
+def test_a_device_or_a_pipe_is_not_replaced(is_linked: bool, tmp_path: Path) -> None:
+    path = tmp_path / "out.json"
+    os.mkfifo(tmp_path / "pipe")
+    if is_linked:
+        path.symlink_to("pipe")
+    else:
+        path = tmp_path / "pipe"
+    with pytest.raises(InputError, match="a device or a pipe: name a file"), whole_file(path) as partial:
+        partial.write_text("{}")
+    assert path.is_fifo() and path.is_symlink() == is_linked
+    assert {each.name for each in tmp_path.iterdir()} == {"pipe", path.name}

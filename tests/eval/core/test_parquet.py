@@ -1,6 +1,9 @@
 """Large tables as Parquet: what is read of it is what is read of the CSV."""
 
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +15,7 @@ from eval.core import parquet
 from eval.core.tablefile import read_table, table_file, write_rows
 
 pytest.importorskip("pyarrow", reason="the extra `parquet` is not installed")
+resource = pytest.importorskip("resource", reason="there are no limits of processes")
 N = 12
 
 
@@ -101,3 +105,37 @@ def test_a_part_that_expands_too_far_is_refused(tmp_path: Path) -> None:
     write_rows(tmp_path / "regions.csv", rows())
     with pytest.raises(InputError, match="expands to more than 50 bytes"):
         parquet.read_parquet(tmp_path / "regions.parquet", most_bytes=50)
+
+
+def test_a_part_that_is_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    (tmp_path / "regions.parquet").mkdir()
+    os.mkfifo(tmp_path / "regions.parquet" / "00000-a.parquet")
+    with pytest.raises(InputError, match="it is a device or a pipe"):
+        read_table(tmp_path / "regions.parquet")
+
+
+def test_the_process_that_reads_has_limits_that_follow_the_size(tmp_path: Path) -> None:
+    import pyarrow as pa  # noqa: PLC0415 - an extra
+    from pyarrow import parquet as pq  # noqa: PLC0415 - an extra
+
+    (tmp_path / "regions.parquet").mkdir()
+    part = tmp_path / "regions.parquet" / "00000-a.parquet"
+    one = pa.array(["x" * 200_000])
+    column = pa.DictionaryArray.from_arrays(pa.array(np.zeros(20_000, np.int32)), one)
+    pq.write_table(pa.table({"scenario": column}), part)  # 4 GB of text
+    assert part.stat().st_size < 100_000
+    with pytest.raises(InputError, match=r"cannot be read|was killed"):
+        read_table(tmp_path / "regions.parquet")
+    assert 1024 * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss < 1 << 30
+
+
+def test_limits_that_are_lower_already_are_kept(tmp_path: Path) -> None:
+    write_rows(tmp_path / "regions.csv", rows())
+    expected = (tmp_path / "regions.csv").read_bytes()
+    code = "import sys\nfrom pathlib import Path\nfrom eval.core.parquet import read_parquet\n"
+    code += "if __name__ == '__main__':\n    sys.stdout.buffer.write(read_parquet(Path(sys.argv[1])))\n"
+    (tmp_path / "read.py").write_text(code)
+    words = ["sh", "-c", 'ulimit -t 7 && exec "$@"', "sh", sys.executable, "read.py", "regions.parquet"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, check=False)
+    assert (done.stdout, done.stderr) == (expected, b"")

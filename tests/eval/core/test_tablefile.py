@@ -1,5 +1,6 @@
 """Tables that are none."""
 
+import lzma
 from pathlib import Path
 
 import pytest
@@ -15,3 +16,20 @@ def test_a_row_with_more_cells_than_the_header_is_one_line(tmp_path: Path, row: 
     with pytest.raises(InputError, match=r"results\.csv: cannot be read as a table: .*") as error:
         read_table(path)
     assert "\n" not in str(error.value)
+
+
+def test_a_packed_table_of_empty_cells_is_refused_before_it_is_parsed(tmp_path: Path) -> None:
+    path = tmp_path / "regions.csv.xz"
+    path.write_bytes(lzma.compress(b",".join(b"c" for _ in range(1000)) + b"\n" + b"," * 40_000_000, preset=0))
+    assert path.stat().st_size < 100_000
+    with pytest.raises(InputError, match=r"40001000 cells, more than \d+$"):
+        read_table(path)
+
+
+def test_more_columns_than_any_table_of_ours_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "regions.csv"
+    path.write_bytes(b"a" + b",a" * 9_999 + b"\n")
+    assert len(read_table(path).columns) == 10_000
+    path.write_bytes(b"a" + b",a" * 10_000 + b"\n")
+    with pytest.raises(InputError, match=r"10001 columns, more than 10000$"):
+        read_table(path)

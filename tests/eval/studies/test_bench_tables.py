@@ -54,3 +54,15 @@ def test_another_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"profile.json: no table of `tunnelcd bench`"):
         main([path], tmp_path / "tables.md")
     assert not (tmp_path / "tables.md").exists()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("machine", {}), ("machine", [1]), ("rows", [ROW, {}]), ("rows", [ROW, ROW | {"name": []}]),
+     ("rows", [ROW | {"value": "much"}]), ("rows", [GROWTH, 3]), ("rows", [GROWTH | {"low": None}])],
+)  # fmt: skip
+def test_a_damaged_table_is_one_line(key: str, value: object, tmp_path: Path) -> None:
+    path = tmp_path / "bench.json"
+    path.write_text(json.dumps({"machine": MACHINE, "rows": [ROW]} | {key: value}))
+    with pytest.raises(InputError, match=r"^\S*bench.json: damaged tables [^\n]*: name files of --out$"):
+        main([path], tmp_path / "tables.md")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -162,3 +163,15 @@ def test_the_csv_has_one_row_per_seed_and_the_reasons(tmp_path: Path) -> None:
     assert (rows[1]["hull_m3_min"], rows[2]["before_path_m"]) == ("", "")
     with pytest.raises(InputError, match="cannot write there"):
         write_csv(tmp_path / "absent" / "survey.csv", [])
+
+
+def test_a_full_disk_leaves_the_earlier_survey(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    path = tmp_path / "survey.csv"
+    path.write_bytes(b"earlier")
+    monkeypatch.setattr(csv.DictWriter, "writerows", fail)
+    with pytest.raises(InputError, match=r"survey\.csv: cannot write there: No space left on device"):
+        write_csv(path, [Survey("f", (), (Failure("f", 1, "x"),))])
+    assert [(each.name, each.read_bytes()) for each in tmp_path.iterdir()] == [("survey.csv", b"earlier")]

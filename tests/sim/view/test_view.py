@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import builtins
+import errno
 import re
 import socket
 import time
@@ -344,6 +345,20 @@ def test_the_page_is_one_file_that_loads_nothing(shown: View, tmp_path: Path) ->
     assert file.stat().st_size > small.stat().st_size + 10_000
     with pytest.raises(InputError, match=r"none/x\.html: "):
         write_html(view, tmp_path / "none" / "x.html")
+
+
+def test_a_full_disk_leaves_the_earlier_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fill(path: Path, text: str, **_: str) -> None:
+        with path.open("w", encoding="utf-8") as file:
+            file.write(text[:100])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    page = tmp_path / "x.html"
+    page.write_bytes(b"earlier")
+    monkeypatch.setattr(Path, "write_text", fill)
+    with pytest.raises(InputError, match=r"x\.html: cannot be written: No space left on device"):
+        write_html(View("x", (), (), (), (), (), np.ones(3), np.zeros(3)), page)
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("x.html", b"earlier")]
 
 
 def test_a_taken_port_and_a_missing_viser_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
