@@ -20,9 +20,15 @@ _NO_DRIFT = "no drift joins"
 
 
 def find_dangling(tree: Any) -> list[Mistake]:
-    """Return every dangling reference of a drawn scenario as (key path, rule)."""
+    """Return every dangling reference of a drawn scenario as (key path, rule).
+
+    Where the tunnel has no nodes, as under a misspelt key, the schema says so, and no reference to one is told.
+    """
     tunnel = mapping_at(tree, "tunnel")
     nodes = [str(name) for name in mapping_at(tunnel, "nodes")]
+    elsewhere = [*_repeated_names(tree), *_area_mistakes(tree)]
+    if not nodes:
+        return elsewhere
     edges = {
         frozenset(pair)
         for drift in items_at(tunnel, "drifts")
@@ -33,7 +39,7 @@ def find_dangling(tree: Any) -> list[Mistake]:
     of_edges = [(key, _no_drift(pair, nodes)) for key, pair in _edges_named(tree) if frozenset(pair) not in edges]
     if of_drifts:  # a misspelt drift joins nothing: only nodes that do not exist are worth a line of their own
         of_edges = [(key, rule) for key, rule in of_edges if not rule.startswith(_NO_DRIFT)]
-    return [*of_drifts, *of_edges, *_node_mistakes(tree, nodes), *_repeated_names(tree), *_area_mistakes(tree)]
+    return [*of_drifts, *of_edges, *_node_mistakes(tree, nodes), *elsewhere]
 
 
 def _drift_mistakes(tunnel: Any, nodes: list[str]) -> Iterator[Mistake]:

@@ -6,7 +6,7 @@ import difflib
 import json
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -121,6 +121,7 @@ def validate(model: type[ModelT], document: Document) -> ModelT:
                 f"{document.source}: {error.error_count()} mistakes: is it another kind of file?"
             ) from error
         mistakes = error.errors()
+        mistakes = _without_misspelt(model, mistakes)
         lines = [visible(_describe_mistake(model, document, item)) for item in mistakes[:_MAX_TOLD]]
         if len(mistakes) > _MAX_TOLD:
             lines.append(f"{document.source}: and {len(mistakes) - _MAX_TOLD} more mistakes")
@@ -210,14 +211,25 @@ def split_section(document: Document, name: str) -> tuple[Document, Document | N
 
 def suggest(word: str, known: Iterable[str], prefix: str = "") -> str:
     """Return `; did you mean "…"?` for the closest known word, written behind a prefix, or "" where none is close."""
-    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
-    return f'; did you mean "{prefix}{close[0]}"?' if close else ""
+    near = _nearest(word, known)
+    return f'; did you mean "{prefix}{near}"?' if near else ""
+
+
+def _nearest(word: str, known: Iterable[str]) -> str | None:
+    return next(iter(difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)), None)
 
 
 # What pydantic says in the words of Python, in those of a file.
 _LIST = "expected a list, such as [a, b] or lines that begin with -"
 _GROUP = "expected keys with values, such as {key: value}"
 _OF_YAML = {"tuple_type": _LIST, "list_type": _LIST, "dict_type": _GROUP, "model_type": _GROUP}
+
+
+def _without_misspelt(model: type[BaseModel], mistakes: Sequence[Any]) -> list[Any]:
+    """Return the mistakes less the missing keys that are there under a misspelt name: the unknown key suggests them."""
+    unknown = [tuple(each["loc"]) for each in mistakes[:_MAX_TOLD] if each["type"] == "extra_forbidden"]
+    meant = {(*key[:-1], _nearest(str(key[-1]), _fields_at(model, key[:-1]))) for key in unknown}
+    return [each for each in mistakes if each["type"] != "missing" or tuple(each["loc"]) not in meant]
 
 
 def _describe_mistake(model: type[BaseModel], document: Document, error: Any) -> str:

@@ -58,6 +58,9 @@ from eval.tables.regions.table import region_tables
 from eval.tables.surface.table import FILES as SURFACE_FILES
 from eval.tables.surface.table import surface_tables
 
+# What provenance.json says of the run that made the cells; plan, settings and checkpoints are those of the last run.
+_OF_THE_START = ("started", "finished", "command", "machine")
+_OF_THE_MAKING = (*_OF_THE_START, "git_commit", "versions")
 _MAP_CELL_M = 0.1  # pictures number no smaller cells
 _MAPS = {"before_points": ArraySpec("N,3", "float32"), "after_points": ArraySpec("M,3", "float32")}
 
@@ -245,8 +248,23 @@ def current_results(run: RunFolder, earlier: Mapping[str, Any], now: Mapping[str
     return results if len(results) == len(cells) else None
 
 
+def keep_makers(now: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the provenance of a run that made no cell: who made the cells, when and how stays.
+
+    Args:
+        now: The provenance of the present run.
+        earlier: That of the run before, {} where there was none. Code and packages that differ from its own and write
+            the tables now go under "tables".
+    """
+    made = {name: earlier[name] for name in _OF_THE_MAKING if name in earlier}
+    tables = {name: now[name] for name in ("git_commit", "versions") if made.get(name, now[name]) != now[name]}
+    return {**now, **made, **({"tables": tables} if tables else {})}
+
+
 def _lasting(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in provenance.items() if key not in {"started", "finished", "command", "machine"}}
+    tables = provenance.get("tables")
+    told = {**provenance, **tables} if isinstance(tables, Mapping) else provenance
+    return {name: value for name, value in told.items() if name not in {*_OF_THE_START, "tables"}}
 
 
 def reported(provenance: Mapping[str, Any]) -> tuple[str, ...]:

@@ -28,7 +28,7 @@ from eval.plans.plan import Plan
 from eval.plans.variants import Cell
 from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Tools, pair_lock
 from eval.running.run_workers import remove_traces, run_on_workers
-from eval.running.runfolder import RunFolder, current_results, write_json, write_tables
+from eval.running.runfolder import RunFolder, current_results, keep_makers, write_json, write_tables
 from eval.running.scaling.keeping import Keep, drop_pair, dropped_file, is_dropped, remove_leftovers
 from eval.running.scaling.mirror import Mirror
 from eval.running.scaling.remaking import remake_pair
@@ -102,10 +102,12 @@ def run_plan(
     _tell_idle(where, len(chosen), progress)
     made = Made(provenance["git_commit"])
     results = None if n_todo else current_results(run, run.stored_provenance(), provenance)
+    if not n_run:
+        provenance = keep_makers(provenance, run.stored_provenance())
     # an unusable cluster is reported before anything is written
     with nullcontext() if where == HERE or not chosen else connected(where, len(chosen)) as client:
         if results is None:
-            write_json(run.path / "provenance.json", provenance)
+            write_json(run.path / "provenance.json", {**provenance, "finished": None})
         remove_traces(run)
         # cells left by --limit may be outdated as well, and no table may hold outdated cells
         remove_leftovers(run)
@@ -122,7 +124,7 @@ def run_plan(
     progress.cells("done", n_run, n_run)
     if results is None:
         results = write_tables(run)
-        write_json(run.path / "provenance.json", {**provenance, "finished": tools.now()})
+        write_json(run.path / "provenance.json", {**provenance, "finished": provenance["finished"] or tools.now()})
     if mirror is not None:
         mirror.copy_tables(run)
     n_died = int((results["status"] == "worker_died").sum())

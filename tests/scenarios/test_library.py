@@ -134,6 +134,14 @@ def test_mistakes_in_settings_are_told_as_such(tmp_path: Path) -> None:
         load_scenario(path, 0, ["platform"])
 
 
+@pytest.mark.parametrize("name", ["tunnel:", "  nodes:"])
+def test_a_misspelt_section_is_one_mistake_and_its_consequences_are_none(tmp_path: Path, name: str) -> None:
+    assert WORLD.count(name) == 1
+    path = written(tmp_path, WORLD.replace(name, f"{name.rstrip(':')}s:"))
+    (line,) = mistakes_of(path)
+    assert f'unknown key; did you mean "{name.strip(" :")}"?' in line
+
+
 def test_frozen_leaves_the_world_as_the_before_session_saw_it(tmp_path: Path) -> None:
     path = written(tmp_path, WORLD)
     plain, frozen = load_scenario(path, 1), load_scenario(path, 1, ["frozen=true"])

@@ -19,16 +19,20 @@ class Box(Settings):
 
 
 def test_all_mistakes_are_told_at_once_by_line() -> None:
-    text = "name: 3\nballs:\n  - radius_m: 1\n  - radius: 2\n    colour: blue\n  - radius_m: -1\nspares: {}\n"
+    text = (
+        "name: 3\nballs:\n  - radius_m: 1\n  - radius: 2\n    colour: blue\n  - radius_m: -1\n  - color: blue\n"
+        "spares: {}\n"
+    )
     with pytest.raises(InputError) as caught:
         validate(Box, read_yaml(Path("box.yaml"), text))
     lines = str(caught.value).splitlines()
     heads = {
         "box.yaml:1: name = 3: ": "",
-        "box.yaml:4: balls.1.radius_m: ": "",
-        "box.yaml:4: balls.1.radius = 2: ": '"radius_m"',
+        "box.yaml:4: balls.1.radius = 2: ": '"radius_m"',  # and not that radius_m is missing
         "box.yaml:6: balls.2.radius_m = -1: ": "greater than 0",
-        "box.yaml:7: spares = {}: ": '"spare"',
+        "box.yaml:7: balls.3.color = 'blue': ": '"colour"',
+        "box.yaml:7: balls.3.radius_m: missing": "",
+        "box.yaml:8: spares = {}: ": '"spare"',
     }
     assert len(lines) == len(heads)
     for head, hint in heads.items():

@@ -121,6 +121,23 @@ def test_finished_cells_are_kept(smoke_copy: RunFolder, runner: Runner) -> None:
     assert before == {path: path.stat().st_mtime_ns for path in before}
 
 
+def test_a_run_that_makes_no_cell_leaves_who_made_them(smoke_copy: RunFolder, runner: Runner) -> None:
+    """Other code, command and time: the provenance still names those that the rows are of; the tables are written."""
+    before = smoke_copy.provenance()
+    (smoke_copy.path / "summary.csv").unlink()
+    later = replace(runner.tools, commit=lambda: "f" * 40, now=lambda: "2999-01-01T00:00:00+00:00")
+    assert runner.run(smoke_copy.path, load_plan("smoke"), command=["again"], tools=later)[1].n_done == 0
+    told = smoke_copy.provenance()
+    assert told.pop("tables") == {"git_commit": "f" * 40}
+    assert told == before
+    assert (smoke_copy.path / "summary.csv").is_file()
+    smoke_copy.cell(ONE_BOX, 20000, "paper").unlink()
+    runner.run(smoke_copy.path, load_plan("smoke"), command=["again"], tools=later)
+    assert smoke_copy.provenance()["git_commit"] == "f" * 40
+    assert "tables" not in smoke_copy.provenance()
+    assert smoke_copy.provenance()["finished"] == "2999-01-01T00:00:00+00:00"
+
+
 def test_a_cell_cut_short_is_done_again_and_no_other(smoke_copy: RunFolder, runner: Runner) -> None:
     cut = smoke_copy.cell(ONE_BOX, 20000, "paper")
     cut.write_text(cut.read_text()[:-50])
@@ -487,9 +504,9 @@ def test_tables_that_are_there_are_put_together_again_only_where_something_may_h
     tools = replace(runner.tools, commit=lambda: commit[0], now=lambda: next(times))
 
     def is_written(plan: Plan) -> bool:
-        earlier = run.provenance().get("finished")
+        earlier = results.stat().st_mtime_ns if results.is_file() else 0
         assert runner.run(run.path, plan, tools=tools)[1].n_done == 0
-        return bool(run.provenance()["finished"] != earlier)
+        return results.stat().st_mtime_ns != earlier
 
     plan = plan_of(tmp_path)
     run, _ = runner.run(tmp_path / "run", plan, tools=tools)
