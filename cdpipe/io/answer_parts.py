@@ -23,6 +23,9 @@ Failure = Literal["failed", "merge_refused", "worker_died"]
 # Texts go into every table and page: a settings text of a variant has some hundred letters, a traceback some thousand.
 MAX_ERROR = 10_000
 _Name = Annotated[str, Field(max_length=1_000)]
+# Rows of tables hold them as `name version;name version`.
+_PackageName = Annotated[str, Field(max_length=1_000, pattern=r"^[^; ]+$")]
+_PackageVersion = Annotated[str, Field(max_length=1_000, pattern=r"^[^;]*$")]
 _Figures = Annotated[dict[_Name, float], Field(max_length=1_000)]
 _Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 _Four = Field(min_length=4, max_length=4)
@@ -78,7 +81,7 @@ class FailurePart(_Part):
     evidence: _Figures = Field(default_factory=dict)
     config: dict[str, Any] = Field(default_factory=dict)
     checkpoints: dict[_Name, _Name] = Field(default_factory=dict, max_length=100)
-    extras: dict[_Name, _Name] = Field(default_factory=dict, max_length=100)
+    extras: dict[_PackageName, _PackageVersion] = Field(default_factory=dict, max_length=100)
     # fields of an answer are allowed and ignored
     before_T_after: Any = None
     radius_m: Any = None

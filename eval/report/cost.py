@@ -34,6 +34,7 @@ _QUALITIES = {
     "regions": {_RECALL_AT_RATE: "recall at 0.1 false regions per 100 m", _RECALL_AT_K: "recall at K"},
     "objects": {_F1: "F1 of objects at IoU 0.5"},
 }
+_NOTHING = {_TIME: 1e-6, _BYTES: 1.0}
 _COSTS = {_TIME: ("time of a pair [s], median", 1.0), _BYTES: ("kept of the before map [kB], mean", 1000.0)}
 _GREY = "#8a8a8a"
 _FRONT = Look(BLUE, 1.6)
@@ -147,7 +148,10 @@ def _drawing(own: pd.DataFrame, words: str) -> Drawing:
             if not (own["cost"] == cost).any():
                 continue
             points = of_domain[of_domain["cost"] == cost]
-            points = points.assign(x=points["cost_value"] / unit, competes=_competes(points))
+            # less than any program costs: like 0 it has no place on the axis, which all other methods need
+            is_nothing = points["cost_value"] < _NOTHING[cost]
+            x_values = (points["cost_value"] / unit).mask(is_nothing, 0.0)
+            points = points.assign(x=x_values, competes=_competes(points))
             best = points[points["is_on_front"].astype(bool)].sort_values("x", kind="stable")
             n_pairs = int(points["n_pairs"].max()) if len(points) else 0
             # room for names at the left; a cost of 0 has no place on the axis

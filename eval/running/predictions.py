@@ -103,15 +103,21 @@ def evaluate(predict: Callable[[Path, Path], object], run: Path | str, name: str
     require_free_name(folder, name)
     require_current_scores(folder)
     with TemporaryDirectory(prefix="tunnelcd-") as place:
-        pair, answer, answers = (Path(place) / part for part in ("pair", "answer", "answers"))
-        for original in list_pairs_blindly(folder):
+        pair, answer, kept, answers = (Path(place) / part for part in ("pair", "answer", "kept", "answers"))
+        kept.mkdir()
+        originals = list_pairs_blindly(folder)
+        for number, original in enumerate(originals):
             pair.mkdir()
             answer.mkdir()
             copy_pair(original, pair)
             predict(pair, answer)
-            copy_folder(answer, answers / original.parent.name / original.name)
+            # answers stand beside the pairs that are still to come: their names tell nothing before the last call
+            copy_folder(answer, kept / str(number))
             remove(pair)
             remove(answer)
+        for number, original in enumerate(originals):
+            (answers / original.parent.name).mkdir(parents=True, exist_ok=True)
+            (kept / str(number)).rename(answers / original.parent.name / original.name)
         add_predictions(folder, answers, name)
     results = read_table(folder.path / "results.csv")
     return results[results["variant"] == name]

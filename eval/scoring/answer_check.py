@@ -270,7 +270,8 @@ def _require_all(name: str, is_right: BoolArray, values: Float64Array, expected:
 def _require_near(name: str, places_m: Float64Array) -> None:
     """Raise unless (N, 3) places are finite and near enough to be places."""
     _require_finite(name, places_m)
-    is_far = (np.abs(places_m) > FARTHEST_M).any(axis=1)
+    # whole numbers have a smallest one, whose size is no whole number: as such it would count as near
+    is_far = (np.abs(places_m.astype(np.float64)) > FARTHEST_M).any(axis=1)
     if is_far.any():
         raise ValueError(f"{name}: entry {int(np.argmax(is_far))} is farther than {FARTHEST_M:g} m from the origin")
 

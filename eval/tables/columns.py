@@ -12,6 +12,7 @@ import numpy as np
 EN_DASH = "\u2013"
 THIN_SPACE = "\u2009"
 UNDEFINED = EN_DASH
+_BILLIONTH = 1e-9
 
 
 def share(value: float) -> str:
@@ -30,9 +31,11 @@ def spaced(variant: str) -> str:
 
 
 def significant(value: float) -> str:
-    """Write three significant digits without an exponent, for seconds and volumes."""
+    """Write three significant digits for seconds and volumes, with an exponent below a billionth."""
     if not math.isfinite(value):
         return UNDEFINED
+    if abs(value) < _BILLIONTH:  # nothing that is measured; its zeros would push a table off the page
+        return f"{value + 0.0:.3g}"
     if abs(value) >= 100:
         return f"{value:.0f}"
     return np.format_float_positional(value, precision=3, fractional=False, unique=False, trim="-")

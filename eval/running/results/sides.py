@@ -11,6 +11,8 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import suggest
+from eval.plans.cells import list_planned_cases
+from eval.plans.coverage import read_stored_plan
 from eval.running.results.run_data import RunData, covered_by, read_run
 from eval.running.results.values import Row, flag
 from eval.scoring.scoring import METRICS_VERSION
@@ -80,6 +82,8 @@ def check_versions(a: Side, b: Side) -> None:
 def check_extras(side: Side) -> None:
     """Refuse a run in which an optional package answered for some rows of a method and not, or otherwise, for others.
 
+    What the answers of other programs say of their packages is their own statement, and stops no page.
+
     Raises:
         InputError: Rows of one variant depend on two versions of a package, or on one that some of them lacked.
     """
@@ -90,8 +94,11 @@ def check_extras(side: Side) -> None:
         for used in filter(None, told.split(";") if isinstance(told, str) else ()):
             name, _, version = used.partition(" ")
             found.setdefault((str(row["variant"]), name), set()).add(version)
-    for (variant, name), versions in found.items():
-        if len(versions) > 1:
+    mixed = {key: versions for key, versions in found.items() if len(versions) > 1}
+    plan = read_stored_plan(side.data.provenance) if mixed else None
+    ours = None if plan is None else {variant for _, _, variant in list_planned_cases(plan)}
+    for (variant, name), versions in mixed.items():
+        if ours is None or variant in ours:
             raise InputError(
                 f"{side.path}: rows of {variant} are of {name} {' and '.join(sorted(versions))}: make them "
                 "all with one of them"

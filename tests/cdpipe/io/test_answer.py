@@ -78,6 +78,13 @@ def test_a_radius_of_each_region_survives_the_disk_and_one_of_all_is_a_number_as
     assert read.regions.radii_m.tolist() == [4.5, 4.5]
 
 
+@pytest.mark.parametrize("extras", [{"a;b": "1"}, {"a b": "1"}, {"": "1"}, {"a": "1;a 2"}])
+def test_a_package_that_tables_would_read_as_two_is_refused(tmp_path: Path, extras: dict[str, str]) -> None:
+    write_answer(tmp_path, "mine", replace(_report(), extras=extras))
+    with pytest.raises(InputError, match=r"answer\.json: extras\."):
+        read_answer(tmp_path)
+
+
 def _surface() -> SurfaceField:
     return SurfaceField(
         points_map=np.arange(9.0).reshape(3, 3),

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from eval.report.cost import COLUMNS, draw_pareto, front, pareto_table
+from eval.report.cost import COLUMNS, _drawing, draw_pareto, front, pareto_table
 from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
 from tests.eval.report.drawing.drawn import read_panels
@@ -129,3 +129,12 @@ def test_methods_at_one_place_share_a_label(tmp_path: Path) -> None:
     (chart,) = draw_pareto(pareto_table(run(tmp_path, methods)))
     labels = [text for row in read_panels(chart.drawing) for panel in row for text in panel.texts.get("label", ())]
     assert labels == ["tunnelcd", "paper, untrained"] * 2
+
+
+def test_a_cost_of_nothing_leaves_the_axis_to_the_others(tmp_path: Path) -> None:
+    methods = {"tunnelcd": (0.9, 3.0, 5.0), "c2c": (0.2, 2.0, 9.0)}
+    tiny = {"theirs": (0.5, 5e-324, 5e-324)}
+    (alone,), (beside,) = (_drawing(pareto_table(run(tmp_path, each)), "x").rows for each in (methods, methods | tiny))
+    assert [panel.x.span for panel in beside] == [panel.x.span for panel in alone]
+    (chart,) = draw_pareto(pareto_table(run(tmp_path, methods | tiny)))
+    assert "theirs" in chart.caption  # its figures stay as it stated them

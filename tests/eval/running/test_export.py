@@ -271,6 +271,18 @@ def test_a_function_is_evaluated_on_blind_copies(run: RunFolder, tmp_path: Path)
     assert rows[["scenario", "seed", "status"]].to_numpy().tolist() == [[WORLD, seed, "failed"] for seed in SEEDS]
 
 
+def test_a_function_sees_no_name_of_the_pairs_before(run: RunFolder) -> None:
+    beside: list[str] = []
+
+    def predict(pair: Path, out: Path) -> None:
+        beside.extend(str(path.relative_to(pair.parent)) for path in pair.parent.rglob("*"))
+        failed(out)
+
+    evaluate(predict, run.path, "theirs")
+    assert any(name.endswith("answer.json") for name in beside)  # the answer about the first pair is there
+    assert [name for name in beside if "sealed" in name or any(str(seed) in name for seed in SEEDS)] == []
+
+
 @pytest.mark.parametrize("is_reversed", [False, True])
 def test_the_order_of_the_copies_is_that_of_their_opaque_names(
     run: RunFolder, monkeypatch: pytest.MonkeyPatch, is_reversed: bool

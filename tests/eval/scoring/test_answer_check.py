@@ -137,6 +137,7 @@ REGIONS = ChangeRegions(
         ({"keyframe_scores": np.array([0.0, TOO_MUCH, NAN])}, 3, "keyframe_scores: entry 1 is larger"),
         ({"centres_map": np.array([(0.0, 0.0, 0.0), (0.0, NAN, 0.0)])}, 3, "region_centres_map: entry 1 is not"),
         ({"centres_map": np.array([(0.0, 0.0, 0.0), (0.0, 0.0, -FAR)])}, 3, "region_centres_map: entry 1 is farther"),
+        ({"centres_map": np.array([(0, 0, 0), (0, 0, -(2**63))])}, 3, "region_centres_map: entry 1 is farther"),
         ({"proposed_centres_map": np.zeros((2, 3))}, 3, None),
         (
             {"proposed_centres_map": np.array([(0.0, 0.0, 0.0), (FAR, 0.0, 0.0)])},

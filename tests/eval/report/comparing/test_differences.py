@@ -256,6 +256,17 @@ def test_rows_with_and_without_an_extra_are_not_mixed(write: Write) -> None:
             compared(*sides)
 
 
+def test_what_another_program_says_of_its_packages_stops_no_page(write: Write, tmp_path: Path) -> None:
+    plan = {"name": "x", "scenarios": ["regions/narrow"], "seeds": [1, 2], "variants": [{"preset": "tunnelcd"}]}
+    rows = [row(1, variant="theirs", extras="a 1"), row(2, variant="theirs", extras="a 2"), row(1), row(2)]
+    (write("theirs", rows) / "provenance.json").write_text(json.dumps({"plan": plan}))
+    assert write_page(tmp_path / "theirs").exists()
+    rows[2:] = [row(1, extras="a 1"), row(2, extras="a 2")]
+    (write("ours", rows) / "provenance.json").write_text(json.dumps({"plan": plan}))
+    with pytest.raises(InputError, match="rows of tunnelcd are of a 1 and 2"):
+        write_page(tmp_path / "ours")
+
+
 def test_runs_that_share_nothing_and_rows_that_stand_twice_are_refused(write: Write) -> None:
     a, b = write("a", [row(1)]), write("b", [row(2)])
     with pytest.raises(InputError, match="share no session pair and variant"):
