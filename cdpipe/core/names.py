@@ -41,7 +41,8 @@ def require_name(name: str) -> str:
     """Return a name that a user chose.
 
     Raises:
-        ValueError: It has no letter or digit, is too long for a folder's name, or holds a character that is not shown.
+        ValueError: It has no letter or digit, is too long for a folder's name, holds a character that is not shown, or
+            begins or ends with a space, which a table does not show.
     """
     if not re.search(r"[A-Za-z0-9]", name):
         raise ValueError("expected a name with a letter or a digit of ASCII")
@@ -49,6 +50,8 @@ def require_name(name: str) -> str:
         raise ValueError(f"is too long: expected at most {LONGEST} characters")
     if visible(name) != name:
         raise ValueError("expected a name without control characters")
+    if name != name.strip():
+        raise ValueError("expected a name without spaces at its ends")
     return name
 
 

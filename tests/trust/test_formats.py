@@ -28,7 +28,7 @@ from cdpipe.model.alignment import PathAlignment
 from cdpipe.sensor.ouster import parse_metadata
 from cdpipe.training.fit import FitConfig, fit
 from cdpipe.training.shard import FIELDS, encode_shard, read_shard
-from eval.leaderboard.evaluation import CallFile, EvaluationFile
+from eval.leaderboard.evaluation import EvaluationFile
 from eval.leaderboard.submission import Submission
 from eval.running.runfolder import RunFolder, open_run_folder, write_json
 from eval.running.scaling.keeping import Dropped
@@ -252,7 +252,7 @@ def test_a_shard_of_another_format_is_named(tmp_path: Path) -> None:
             read_shard(path)
 
 
-@pytest.mark.parametrize("model", [AnswerPart, Submission, EvaluationFile, CallFile, Dropped])
+@pytest.mark.parametrize("model", [AnswerPart, Submission, EvaluationFile, Dropped])
 def test_documents_of_a_newer_format_say_so(model: type[BaseModel]) -> None:
     for version, told in ((2, f"; {NEWER}"), (0, "")):
         with pytest.raises(InputError) as error:

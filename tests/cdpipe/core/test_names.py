@@ -43,7 +43,7 @@ def test_names_that_would_share_a_folder_are_equal_when_folded(names: tuple[str,
     assert folded(names[0]) == folded(names[1])
 
 
-@pytest.mark.parametrize("name", ["", "..", "___", "ä", "n" * 201, "a\x1bb", "a\nb", "a\u202eb"])
+@pytest.mark.parametrize("name", ["", "..", "___", "ä", "n" * 201, "a\x1bb", "a\nb", "a\u202eb", "paper ", "\u3000a"])
 def test_what_is_no_name(name: str) -> None:
     with pytest.raises(ValueError, match=r"name|too long"):
         require_name(name)
