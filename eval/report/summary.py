@@ -22,7 +22,7 @@ from eval.running.results.run_data import RunData, covered_by, ends_at_merge, sh
 from eval.running.results.sides import is_contended
 from eval.running.results.values import Row, number, text
 from eval.running.runfolder import reported
-from eval.scoring.surface_windows import AREAS_M2
+from eval.scoring.surface.windows import AREAS_M2
 from eval.tables.columns import Column, fine, select, share, spaced
 from eval.tables.merge_table import ALL_FAMILIES, RIGHT_DEG, RIGHT_M
 from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, by_domain, is_told_the_truth, numbers, records, with_domain

@@ -36,7 +36,7 @@ from eval.scoring.object_metrics import (
 from eval.scoring.object_sizes import SizeErrors, compute_size_errors, summarise_size_errors
 from eval.scoring.point_metrics import score_points, score_unanswered_points
 from eval.scoring.region_metrics import score_regions, score_unanswered_regions
-from eval.scoring.surface_metrics import score_surface
+from eval.scoring.surface.metrics import score_surface
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
 METRICS_VERSION = 7

@@ -16,7 +16,7 @@ from eval.report.drawing.charts import Chart
 from eval.report.render import render_page, write_file
 from eval.report.surface.unrolled import draw_panels
 from eval.report.tables import Cell, Picture, Table
-from eval.scoring.surface_places import SurfacePlaces, carry_surface
+from eval.scoring.surface.places import SurfacePlaces, carry_surface
 from eval.stories.comparisons import Comparison, Method, refused_sessions
 from eval.stories.places import RADIUS_M, ChosenPlace, choose_places, follow_places
 from eval.stories.props import HIDDEN, MISSED, NO_ANSWER, OTHER_KIND, RIGHT, count_objects, follow_props

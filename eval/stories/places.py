@@ -13,7 +13,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.model.report import SurfaceField
 from cdpipe.surface import middle_place
-from eval.scoring.surface_places import ANSWERED_M, SurfacePlaces, find_surface_places
+from eval.scoring.surface.places import ANSWERED_M, SurfacePlaces, find_surface_places
 from eval.stories.comparisons import Comparison
 
 RADIUS_M = 0.3

@@ -17,7 +17,7 @@ from eval.running.results.grids import off_grids
 from eval.running.results.run_data import RunData, every_condition, stored_table
 from eval.running.results.values import number
 from eval.running.runfolder import reported
-from eval.scoring.surface_windows import AREAS_M2
+from eval.scoring.surface.windows import AREAS_M2
 from eval.tables.columns import Column, scaled, select, share, significant
 from eval.tables.rows import ALL_DOMAINS, is_told_the_truth, with_domain
 from eval.tables.surface.limits import EDGES_M, MAGNITUDES_M

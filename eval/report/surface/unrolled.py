@@ -16,7 +16,7 @@ from eval.report.tables import Picture
 from eval.running.results.cases import named_variants
 from eval.running.results.run_data import RunData
 from eval.running.results.values import Row, number
-from eval.scoring.surface_places import SurfacePlaces, carry_surface, find_surface_places
+from eval.scoring.surface.places import SurfacePlaces, carry_surface, find_surface_places
 from eval.truth.ground_truth import load_ground_truth
 
 MAX_METHODS = 6

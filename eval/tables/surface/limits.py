@@ -1,6 +1,6 @@
 """Detection limits of displacement fields: how large a displacement must be to be found, by the area that moved.
 
-Windows (`eval.scoring.surface_windows`) are means over discs. A method has one threshold for each area: 5 % of the
+Windows (`eval.scoring.surface.windows`) are means over discs. A method has one threshold for each area: 5 % of the
 null windows that it covers are beyond it. All null windows are then looked at, those that it hardly covers and those
 that set no threshold too. Where more than 15 % of them are beyond the threshold, it rises until 5 % are: an answer
 that is silent where thresholds come from is not silent elsewhere.

@@ -14,8 +14,8 @@ import pandas as pd
 from cdpipe.core.geometry import BoolArray
 from eval.core.statistics import median
 from eval.plans.targets import Targets
-from eval.scoring.surface_metrics import SURFACE_GROUP
-from eval.scoring.surface_windows import AREAS_M2
+from eval.scoring.surface.metrics import SURFACE_GROUP
+from eval.scoring.surface.windows import AREAS_M2
 from eval.tables.conditions import by_condition
 from eval.tables.rows import by_domain, by_variant, means_with_intervals, numbers, of_cases, texts, with_domain
 from eval.tables.surface.limits import detection_limits

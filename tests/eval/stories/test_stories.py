@@ -32,7 +32,7 @@ from scenarios.schema import (
     Tunnel,
 )
 from sim.story import PairMaker, Story, simulate_story
-from tests.eval.scoring.surface_worlds import report_of, true_field
+from tests.eval.scoring.surface.surface_worlds import report_of, true_field
 
 Command = Callable[..., tuple[int, str, str]]
 LEVEL_M, N = 0.004, 3

@@ -13,7 +13,7 @@ from eval.running.cell_file import cell_document
 from eval.running.results.run_data import read_run
 from eval.running.runfolder import RunFolder, write_json, write_tables
 from eval.scoring.scoring import CaseScore
-from tests.eval.scoring.surface_worlds import score_field, true_field, wall_truth
+from tests.eval.scoring.surface.surface_worlds import score_field, true_field, wall_truth
 
 PATCHES = {1: (5, 0.5, 4, 4, 0.05), 2: (15, 1, 2, 2, -0.2)}
 

@@ -15,10 +15,10 @@ from cdpipe.io.answer import Answer
 from cdpipe.model.report import SurfaceField, SurfaceRegion
 from eval.scoring.answer_check import check_answer
 from eval.scoring.scoring import score_answer
-from eval.scoring.surface_metrics import COLUMNS
-from eval.scoring.surface_places import find_surface_places
+from eval.scoring.surface.metrics import COLUMNS
+from eval.scoring.surface.places import find_surface_places
 from eval.truth.ground_truth import GroundTruth, SessionTruth
-from tests.eval.scoring.surface_worlds import (
+from tests.eval.scoring.surface.surface_worlds import (
     CELL_M2,
     drawn_patches,
     report_of,

@@ -1,6 +1,6 @@
 """Scores of a displacement field: errors, cover, levels of detection, surface changes found, and their volumes.
 
-All figures are over the places that the harness chose (`eval.scoring.surface_places`). A place that an answer leaves
+All figures are over the places that the harness chose (`eval.scoring.surface.places`). A place that an answer leaves
 out counts as displacement 0, so leaving out the difficult places gains nothing.
 """
 
@@ -14,14 +14,14 @@ import numpy as np
 from cdpipe.io.answer import Answer
 from cdpipe.model.report import SurfaceField
 from eval.core.statistics import mean, median
-from eval.scoring.surface_places import (
+from eval.scoring.surface.places import (
     SurfaceAnswer,
     SurfacePlaces,
     carry_surface,
     find_surface_places,
     mark_true_regions,
 )
-from eval.scoring.surface_windows import list_windows
+from eval.scoring.surface.windows import list_windows
 from eval.truth.ground_truth import GroundTruth
 from sim.session.truth import SurfaceChangeTruth
 

@@ -15,14 +15,13 @@ from cdpipe.core.geometry import stream, yaw_pose
 from cdpipe.io.answer import Answer
 from cdpipe.model.report import SurfaceField, SurfaceRegion
 from eval.plans.targets import Targets
-from eval.scoring import surface_windows
 from eval.scoring.answer_check import check_answer
 from eval.scoring.scoring import CaseScore
-from eval.scoring.surface_places import find_surface_places
+from eval.scoring.surface.places import find_surface_places
 from eval.tables.surface.limits import detection_limits
 from eval.tables.surface.table import MEANS, surface_tables
 from eval.truth.ground_truth import GroundTruth
-from tests.eval.scoring.surface_worlds import (
+from tests.eval.scoring.surface.surface_worlds import (
     drawn_patches,
     report_of,
     rows_of_field,
@@ -31,7 +30,7 @@ from tests.eval.scoring.surface_worlds import (
     true_field,
     wall_truth,
 )
-from tests.eval.scoring.test_surface_metrics import LOW, noisy_field
+from tests.eval.scoring.surface.test_surface_metrics import LOW, noisy_field
 
 SEEDS = st.integers(0, 10_000)
 EXAMPLES = settings(max_examples=6, deadline=None, derandomize=True, phases=(Phase.generate,))
@@ -202,7 +201,7 @@ def field_that_says(truth: GroundTruth, displacement_m: np.ndarray) -> SurfaceFi
 @pytest.fixture(name="few_null_windows")
 def few_null_windows_fixture(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a long drift: the windows that set thresholds end long before the rock does."""
-    monkeypatch.setattr(surface_windows, "MAX_NULL_WINDOWS", 8)
+    monkeypatch.setattr("eval.scoring.surface.windows.MAX_NULL_WINDOWS", 8)
 
 
 @pytest.mark.usefixtures("few_null_windows")

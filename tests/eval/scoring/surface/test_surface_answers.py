@@ -12,8 +12,8 @@ from cdpipe.model.report import SurfaceField, SurfaceRegion
 from eval.scoring import answer_check as module
 from eval.scoring.answer_check import MAX_AMOUNT, MAX_DISPLACEMENT_M
 from eval.scoring.scoring import score_answer
-from eval.scoring.surface_metrics import COLUMNS, is_surface_pair, score_surface
-from tests.eval.scoring.surface_worlds import report_of, score_field, surface_columns, true_field, wall_truth
+from eval.scoring.surface.metrics import COLUMNS, is_surface_pair, score_surface
+from tests.eval.scoring.surface.surface_worlds import report_of, score_field, surface_columns, true_field, wall_truth
 from tests.eval.scoring.test_answer_check import FAR, INF, NAN, TOO_MUCH, taken_or_refused
 
 MORE_M = np.nextafter(MAX_DISPLACEMENT_M, INF)

@@ -7,17 +7,16 @@ import pytest
 
 from cdpipe.core.geometry import make_pose, stream
 from cdpipe.model.report import SurfaceField, SurfaceRegion
-from eval.scoring import surface_windows
-from eval.scoring.surface_places import (
+from eval.scoring.surface.places import (
     SurfacePlaces,
     carry_surface,
     find_surface_places,
     mark_true_regions,
 )
-from eval.scoring.surface_windows import find_windows, list_windows
+from eval.scoring.surface.windows import find_windows, list_windows
 from eval.truth.ground_truth import GroundTruth, SurfaceLabels, ground_truth
 from sim.session.truth import PairTruth
-from tests.eval.scoring.surface_worlds import score_field, session, true_field, wall_truth
+from tests.eval.scoring.surface.surface_worlds import score_field, session, true_field, wall_truth
 
 REGION = SurfaceRegion(np.zeros(3), 1.0, 0.1, 0.1, 0.1)
 
@@ -262,7 +261,7 @@ def test_rock_that_moved_and_belongs_to_no_change_is_in_no_window() -> None:
 def test_windows_of_thresholds_are_the_first_and_those_of_checks_lie_all_over(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(surface_windows, "MAX_NULL_WINDOWS", 3)
+    monkeypatch.setattr("eval.scoring.surface.windows.MAX_NULL_WINDOWS", 3)
     places = grid(120, 9, box(range(50, 60), range(9), 1))
     windows, checks = find_windows(places)
     for area_m2 in (1.0, 4.0):
@@ -278,7 +277,7 @@ def test_windows_of_thresholds_are_the_first_and_those_of_checks_lie_all_over(
     least = {1.0: 8, 4.0: 32, 16.0: 128}
     assert all(len(inside) >= least[area] for area, _, _, inside in checks)
     assert all((np.sort(inside) == inside).all() for *_, inside in checks)
-    monkeypatch.setattr(surface_windows, "MAX_CHECK_WINDOWS", 4)
+    monkeypatch.setattr("eval.scoring.surface.windows.MAX_CHECK_WINDOWS", 4)
     _, fewer = find_windows(places)
     assert [each[:3] for each in fewer] == [
         each[:3] for area in (1.0, 4.0, 16.0) for each in [each for each in checks if each[0] == area][:4]
@@ -401,8 +400,8 @@ def list_slowly(places: SurfacePlaces, n_null: int, n_check: int) -> list[tuple[
     ],
 )
 def test_windows_equal_those_of_a_slow_twin(places: SurfacePlaces, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(surface_windows, "MAX_NULL_WINDOWS", 3)
-    monkeypatch.setattr(surface_windows, "MAX_CHECK_WINDOWS", 5)
+    monkeypatch.setattr("eval.scoring.surface.windows.MAX_NULL_WINDOWS", 3)
+    monkeypatch.setattr("eval.scoring.surface.windows.MAX_CHECK_WINDOWS", 5)
     # some rock moved and belongs to no change, some of a change did not move
     true_m = places.true_m.copy()
     true_m[-3:] = 0.5
@@ -436,7 +435,7 @@ def test_without_a_field_there_is_no_region_and_no_false_one() -> None:
 
 
 def test_a_window_of_checks_needs_half_of_its_cells_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(surface_windows, "MAX_NULL_WINDOWS", 1)
+    monkeypatch.setattr("eval.scoring.surface.windows.MAX_NULL_WINDOWS", 1)
     # two blocks of 3 x 3 places 5 m apart; 8 of 16 cells are enough, 7 are not
     block = grid(3, 3).points_map
     for n_places, n_checks in ((8, 1), (7, 0)):

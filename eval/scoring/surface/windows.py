@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
-from eval.scoring.surface_places import PLACE_M, SurfaceAnswer, SurfacePlaces
+from eval.scoring.surface.places import PLACE_M, SurfaceAnswer, SurfacePlaces
 
 AREAS_M2 = (1.0, 4.0, 16.0)
 SPACING_M = 2.0
