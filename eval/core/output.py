@@ -50,8 +50,9 @@ def new_folder(path: Path) -> Iterator[Path]:
         if path.exists():
             path.rmdir()
         partial.replace(path)
-    except BaseException:
+    except BaseException as error:
         _clear(partial, made)
+        _name_output(error, partial, path)
         raise
 
 
@@ -83,6 +84,9 @@ def new_files(*paths: Path) -> Iterator[Path]:
             yield partial
             for path in paths:
                 (partial / path.name).replace(path)
+        except InputError as error:
+            _name_output(error, partial, first.parent)
+            raise
         finally:
             _clear(partial, [])
 
@@ -194,6 +198,12 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+def _name_output(error: BaseException, partial: Path | None, path: Path) -> None:
+    """Let the line of a mistake name the output, and not the hidden folder in which it was begun."""
+    if isinstance(error, InputError) and partial is not None:
+        error.args = tuple(str(told).replace(str(partial), str(path)) for told in error.args)
 
 
 def unwritable(path: Path, error: OSError) -> InputError:

@@ -41,6 +41,15 @@ def test_nothing_is_left_when_the_block_fails(tmp_path: Path, error: type[BaseEx
     assert tree(tmp_path) == []
 
 
+def test_a_mistake_within_names_the_output_and_not_its_hidden_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as error, new_folder(tmp_path / "out") as partial:
+        raise InputError(f"{partial / 'a.html'}: no room")
+    assert str(error.value) == f"{tmp_path / 'out' / 'a.html'}: no room"
+    with pytest.raises(InputError) as error, new_files(tmp_path / "a.yaml", tmp_path / "a.png") as partial:
+        raise InputError(f"{partial / 'a.png'}: no room")
+    assert str(error.value) == f"{tmp_path / 'a.png'}: no room"
+
+
 def test_what_a_killed_run_left_does_not_get_into_the_next(tmp_path: Path) -> None:
     (tmp_path / ".out.partial").mkdir()
     (tmp_path / ".out.partial" / "old").write_text("x")
