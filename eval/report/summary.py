@@ -25,7 +25,17 @@ from eval.running.runfolder import reported
 from eval.scoring.surface.windows import AREAS_M2
 from eval.tables.columns import Column, fine, select, share, spaced
 from eval.tables.merge_table import ALL_FAMILIES, RIGHT_DEG, RIGHT_M
-from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, by_domain, is_told_the_truth, numbers, records, with_domain
+from eval.tables.rows import (
+    ALL_DOMAINS,
+    DOMAINS,
+    PAIR,
+    by_domain,
+    is_answered,
+    is_told_the_truth,
+    numbers,
+    records,
+    with_domain,
+)
 from eval.tables.surface.table import limit_column
 
 _MAX_METHODS = 8
@@ -88,8 +98,7 @@ def _stated(own: pd.DataFrame, key: str) -> Float64Array:
     """Return a column; of a cost nothing if an answer leaves it out: else a method would state it where it is small."""
     values = numbers(own, key)
     is_cost = key.startswith(("t_total", "bytes_"))  # seconds per region are undefined where no region is proposed
-    is_answered = own["status"] == "ok" if "status" in own else own["is_answered"] == 1
-    is_left_out = np.isnan(values) & is_answered.to_numpy(dtype=bool)
+    is_left_out = np.isnan(values) & is_answered(own)
     return np.full(len(values), np.nan) if is_cost and is_left_out.any() else values
 
 

@@ -28,7 +28,7 @@ from eval.tables.columns import (
     spaced,
 )
 from eval.tables.conditions import condition_of_row, told_apart
-from eval.tables.rows import ALL_DOMAINS, PAIR, is_told_the_truth, numbers, records
+from eval.tables.rows import ALL_DOMAINS, PAIR, is_answered, is_told_the_truth, numbers, records
 
 _AT_RATE = "recall_at_0"  # how columns of recall at a rate of false regions per 100 m begin
 
@@ -176,7 +176,7 @@ def used_pairs(cases: pd.DataFrame, variants: Sequence[str], key: str) -> list[t
     if key in cases:
         has_number = ~np.isnan(numbers(cases, key))
     elif key.startswith(_AT_RATE):
-        has_number = (cases["status"] == "ok").to_numpy()
+        has_number = is_answered(cases)
     pair = cases.groupby(PAIR, sort=False).ngroup().to_numpy()
     could = np.isin(pair, pair[has_number])
     variant = cases["variant"].to_numpy()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import BoolArray, Float64Array
 from eval.core.domains import domain_of
 from eval.core.statistics import mean_with_interval
 
@@ -54,6 +54,12 @@ def with_domain(rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> pd.DataFram
     table = (rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows))).copy()  # in one block
     family = texts(table, "family" if "family" in table else "scenario")
     return table.assign(domain=[domain_of(name) for name in family])
+
+
+def is_answered(cases: pd.DataFrame) -> BoolArray:
+    """Mark the rows of results.csv, or of their figures, that are of an answer."""
+    told = cases["status"] == "ok" if "status" in cases else cases["is_answered"] == 1
+    return told.to_numpy(dtype=np.bool_)
 
 
 def by_domain(results: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
