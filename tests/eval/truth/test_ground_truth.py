@@ -86,6 +86,17 @@ def test_poses_that_do_not_fit_are_named(name: str, change_it: object, told: str
         replace(right, **{name: change_it(getattr(right, name))})
 
 
+def test_places_of_movers_and_labels_of_rock_that_do_not_fit_are_named() -> None:
+    right, short, fits = session([0, 0]), np.zeros(1), np.zeros(2)
+    with pytest.raises(ValueError, match=r"^seen_movers_world must be "):
+        replace(right, seen_movers_world=np.zeros((4, 2)))
+    with pytest.raises(ValueError, match=r"^surface\.displacement_m must be \(2\), got \(1,\)"):
+        replace(right, surface=SurfaceLabels(short.astype(np.float32), fits.astype(np.int16)))
+    with pytest.raises(ValueError, match=r"^surface\.change must be \(2\), got \(1,\)"):
+        replace(right, surface=SurfaceLabels(fits.astype(np.float32), short.astype(np.int16)))
+    assert replace(right, surface=SurfaceLabels(fits.astype(np.float32), fits.astype(np.int16))).surface is not None
+
+
 def load_surface_labels(folder: Path, n_scans: Sequence[int]) -> SurfaceLabels | None:
     """Write the labels of five scans of 2 x 3 pixels in chunks of two, and load those of six returns.
 
