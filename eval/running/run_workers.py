@@ -76,6 +76,7 @@ def run_on_workers(
     (folder / _TOKEN).write_text(token)
     try:
         _Dispatch(client, folder, token, pairs, made, progress, done).run()
+        _remove_begun(run)  # a worker may die between the end of a cell and that of its trace
     finally:
         # workers of a cluster outlive this process; without the token they stop after their present cell
         if _token(folder) == token:
@@ -85,6 +86,10 @@ def run_on_workers(
 def remove_traces(run: RunFolder) -> None:
     """Remove the traces of an earlier run, and stop its workers that may still be running."""
     (run.path / _TOKEN).unlink(missing_ok=True)
+    _remove_begun(run)
+
+
+def _remove_begun(run: RunFolder) -> None:
     for trace in [*run.path.glob(f"cells/*/*/.*{_TRACE}"), *run.path.glob(f"pairs/*/.*{_TRACE}")]:
         trace.unlink(missing_ok=True)
 

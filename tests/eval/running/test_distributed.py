@@ -28,10 +28,10 @@ from cdpipe.core.names import path_part
 from eval.core import cluster
 from eval.core.cluster import Where
 from eval.core.terminal import progress
-from eval.core.terminal.progress import Lines
+from eval.core.terminal.progress import Lines, Silent
 from eval.plans.cells import expand_cells
 from eval.plans.plan import Plan, load_plan
-from eval.running import pair_run, runner
+from eval.running import pair_run, run_workers, runner
 from eval.running.pair_run import Made, Tools
 from eval.running.run_workers import Task, _unfit, remove_traces, work_on
 from eval.running.runfolder import RunFolder, start_run_folder, write_json
@@ -501,6 +501,22 @@ def test_what_was_begun_too_often_is_not_begun_again(tmp_path: Path, plan: Plan,
 
 
 @pytest.mark.usefixtures("copies")
+@pytest.mark.parametrize("place", ["cells/world/20000/.paper.begun", "pairs/world/.20000.begun"])
+def test_no_trace_is_left_of_a_worker_that_dies_as_soon_as_its_cell_is_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    run = start_run_folder(tmp_path / "run")
+    trace = run.path / place
+
+    def finish(_: object) -> None:
+        trace.parent.mkdir(parents=True)
+        trace.write_text("1")
+
+    monkeypatch.setattr(run_workers._Dispatch, "run", finish)
+    run_workers.run_on_workers(None, run, [], Made(None), Silent())
+    assert not [path for path in run.path.rglob("*") if path.is_file()]
+
+
 def test_a_run_that_is_stopped_ends_after_the_cell_in_flight(
     tmp_path: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
