@@ -15,6 +15,7 @@ import pytest
 import trimesh
 
 from eval.cli.main import main
+from eval.core.tablefile import read_table, table_file
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -133,8 +134,8 @@ def test_the_table_of_results_is_made_of_committed_rows() -> None:
     folder = ROOT / "reports" / "main"
     key = ["odometry", "domain", "variant"]
     cost = pd.read_csv(folder / "pareto.csv").query("cost == 't_total_s'").drop_duplicates(key[1:]).set_index(key[1:])
-    regions = pd.read_csv(folder / "regions_table.csv").set_index(key)
-    objects = pd.read_csv(folder / "objects_table.csv").set_index(key)
+    regions = read_table(table_file(folder / "regions_table.csv")).set_index(key)
+    objects = read_table(table_file(folder / "objects_table.csv")).set_index(key)
     section = README[README.index("## Results") : README.index("## Five recipes")]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in section.splitlines() if "| `" in line]
     assert 0 < len(rows) <= 10
