@@ -11,6 +11,7 @@ from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.resources.abc import Traversable
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -119,6 +120,16 @@ def read_yaml_text(file: Traversable) -> str:
         return content.decode()
     except UnicodeDecodeError as error:
         raise InputError(f"{file}: not YAML: {error}") from error
+
+
+def read_head_comment(file: Traversable) -> str:
+    """Return the comment at the head of a YAML file on one line, "" where there is none.
+
+    Raises:
+        InputError: As `read_yaml_text`.
+    """
+    lines = takewhile(lambda line: line.startswith("#"), read_yaml_text(file).splitlines())
+    return " ".join(" ".join(line.lstrip("# ") for line in lines).split())
 
 
 def validate(model: type[ModelT], document: Document) -> ModelT:

@@ -17,6 +17,7 @@ import numpy as np
 
 from cdpipe.core.errors import InputError, TunnelcdError
 from cdpipe.core.progress import Progress
+from cdpipe.core.whole_file import whole_file
 from cdpipe.core.yamlfile import suggest
 from cdpipe.descriptors.sphere import anchor_frames, change_log_odds, describe_map
 from cdpipe.merge.merge import merge_maps
@@ -25,7 +26,7 @@ from cdpipe.query.query import find_regions
 from eval.bench.extract import ExtractSite, extract_contests, extract_sites
 from eval.bench.merge import FailedContest, MergeSite, against_limit, merge_contests, paper_sites
 from eval.bench.whole import WholeSite, whole_contests
-from eval.core.output import make_writable, unwritable, whole_file
+from eval.core.output import make_writable, unwritable
 from eval.core.provenance import machine
 from sim.studies.bench import BenchSite, sensor_contests
 from sim.studies.timing import Contest, SkippedContest, timed

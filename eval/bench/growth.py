@@ -16,13 +16,14 @@ import pandas as pd
 from cdpipe.core.errors import InputError
 from cdpipe.core.isolation import ProcessDiedError, run_isolated
 from cdpipe.core.progress import Progress, report_nothing
+from cdpipe.core.whole_file import whole_file
 from cdpipe.core.yamlfile import suggest
 from eval.bench.exponents import fit_growth
 from eval.bench.growth_axes import Axis, list_axes, measure_size
 from eval.core.charts import COLOURS, SYMBOLS, Drawing, Look, Panel, Series, log_span
 from eval.core.charts import Axis as ChartAxis
 from eval.core.figures import picture, png
-from eval.core.output import unwritable, whole_file
+from eval.core.output import unwritable
 from eval.core.provenance import git_commit, machine
 
 LIMIT = 1.1

@@ -19,11 +19,12 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.isolation import ProcessDiedError, run_isolated
 from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.core.threads import THREADS
+from cdpipe.core.whole_file import whole_file
 from cdpipe.descriptors import use_threads
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import SessionWriter
 from eval.bench.meter import MeteredScans, StageMeter
-from eval.core.output import unwritable, whole_file
+from eval.core.output import unwritable
 from eval.core.provenance import git_commit, machine
 from scenarios.library import load_scenario
 from sim.scene import build_world

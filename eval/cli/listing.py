@@ -8,7 +8,7 @@ from textwrap import shorten, wrap
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 from cdpipe.core.plugins import METHODS, METRICS, describe_entry_point, entry_points
-from cdpipe.core.yamlfile import read_yaml, read_yaml_text
+from cdpipe.core.yamlfile import read_head_comment, read_yaml
 from cdpipe.methods.registry import describe_method
 from cdpipe.model.config import preset_files, setting_fields
 from cdpipe.sensor.ouster import describe_profile, profile_names
@@ -68,12 +68,7 @@ def _plans() -> Iterable[Entry]:
 def _presets() -> Iterable[Entry]:
     """Yield the presets; the comment at the head of the file describes one, up to its first full stop."""
     for name, file in preset_files().items():
-        head = []
-        for line in read_yaml_text(file).splitlines():
-            if not line.startswith("#"):
-                break
-            head.append(line.lstrip("# "))
-        yield Entry(name, _one_line(" ".join(head)))
+        yield Entry(name, _one_line(read_head_comment(file)))
 
 
 def _settings() -> Iterable[Entry]:

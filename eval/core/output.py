@@ -12,7 +12,6 @@ from pathlib import Path
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import visible
 from cdpipe.core.whole_file import partial_of
-from cdpipe.core.whole_file import whole_file as whole_file  # noqa: PLC0414 - it is one of the functions of this module
 
 _HEAD_BYTES = 1024
 

@@ -13,7 +13,7 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_bytes
-from eval.core.output import whole_file
+from cdpipe.core.whole_file import whole_file
 from eval.core.parquet import parquet_folder, read_parquet, write_parquet
 
 # xz shrinks a constant column ten thousandfold: what a file may expand to is bounded by its own size.

@@ -25,9 +25,10 @@ from pydantic import AfterValidator, ConfigDict, Field
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import list_members, parse_json, read_bytes, read_member, require_plain_file
 from cdpipe.core.names import LONGEST, path_part, visible
+from cdpipe.core.whole_file import whole_file
 from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.io.answer_parts import MAX_ERROR
-from eval.core.output import made_parents, require_replaceable, unwritable, whole_file
+from eval.core.output import made_parents, require_replaceable, unwritable
 from eval.core.provenance import git_commit, machine, versions
 from eval.leaderboard.evaluation import EvaluationFile, digest_method, digest_pair, read_call, read_evaluation
 from eval.leaderboard.given_merge import MergeMode

@@ -17,7 +17,8 @@ from pathlib import Path, PurePosixPath
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import list_members, read_bytes, read_member, require_plain_file
 from cdpipe.core.names import LONGEST, visible
-from eval.core.output import copy_folder, new_folder, whole_file
+from cdpipe.core.whole_file import whole_file
+from eval.core.output import copy_folder, new_folder
 from eval.core.terminal.progress import RunProgress, Silent
 
 SESSIONS, TRUTH, SUMS = "sessions", "truth", "SHA256SUMS"

@@ -13,8 +13,8 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.core.names import visible
+from cdpipe.core.whole_file import whole_file
 from cdpipe.io.session import read_session
-from eval.core.output import whole_file
 from eval.release.archive import SESSIONS, TRUTH, digest_file, list_files
 from eval.release.content import Release, ReleasePair
 from eval.release.croissant import Column, FileGroup, Table, describe_croissant, write_croissant

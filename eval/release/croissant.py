@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from cdpipe.core.names import visible
-from eval.core.output import whole_file
+from cdpipe.core.whole_file import whole_file
 
 FILE = "croissant.json"
 LICENCE = "https://spdx.org/licenses/MIT.html"

@@ -22,8 +22,9 @@ from tempfile import TemporaryDirectory
 from pydantic import TypeAdapter
 
 from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.whole_file import whole_file
 from eval.core.cluster import HERE, Where, connected, require_usable
-from eval.core.output import made_parents, make_writable, remove, require_no_links, whole_file
+from eval.core.output import made_parents, make_writable, remove, require_no_links
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.release.archive import SESSIONS, SUMS, TRUTH, list_files, pack, read_sums, write_sums
 from eval.release.card import write_release_card

@@ -11,8 +11,8 @@ import jinja2
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import visible
+from cdpipe.core.whole_file import whole_file
 from eval.core.figures import compress_address
-from eval.core.output import whole_file
 
 _FILES = (
     "page.html", "index.html", "comparison.html", "answer.html", "story.html", "leaderboard.html", "parts.html",

@@ -20,12 +20,13 @@ from cdpipe.core.errors import InputError, MergeFailedError, ScenarioError, Tunn
 from cdpipe.core.plugins import extra_version
 from cdpipe.core.progress import Progress
 from cdpipe.core.threads import THREADS
+from cdpipe.core.whole_file import whole_file
 from cdpipe.descriptors import checkpoint_digest, list_checkpoints, use_threads
 from cdpipe.io.answer import write_answer, write_failure
 from cdpipe.methods.registry import PACKAGES, list_extras
 from cdpipe.model.config import WEIGHTS, MapConfig
 from eval.core.domains import domain_of
-from eval.core.output import remove, whole_file
+from eval.core.output import remove
 from eval.core.provenance import canonical_json, digest_parts, git_commit, now
 from eval.core.terminal.progress import RunProgress
 from eval.graft import make_pair

@@ -38,7 +38,8 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArraySpec, read_npz
 from cdpipe.core.geometry.voxel import require_reachable
 from cdpipe.core.names import path_part
-from eval.core.output import make_writable, remove, require_no_links, whole_file
+from cdpipe.core.whole_file import whole_file
+from eval.core.output import make_writable, remove, require_no_links
 from eval.core.provenance import FORMAT_VERSION, TOOL
 from eval.core.statistics import summarise
 from eval.core.tablefile import read_table, write_rows

@@ -17,7 +17,8 @@ import typer
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files.json_file import read_json
-from eval.core.output import unwritable, whole_file
+from cdpipe.core.whole_file import whole_file
+from eval.core.output import unwritable
 from eval.core.terminal.exits import run_program
 from eval.studies.reality.tables import format_markdown
 

@@ -22,6 +22,7 @@ import typer
 from cdpipe.core.geometry import BoolArray, Float64Array, transform
 from cdpipe.core.plugins import require_extra
 from cdpipe.core.threads import THREADS
+from cdpipe.core.whole_file import whole_file
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
 from cdpipe.mapping.mapping import build_map
@@ -29,7 +30,6 @@ from cdpipe.mapping.movers import find_movers
 from cdpipe.methods.dufomap import UNKNOWN_VOXELS, load_dufomap, origin_pose
 from cdpipe.model.config import PipelineConfig, load_config
 from cdpipe.model.types import PointMap, ScanSource, SessionName
-from eval.core.output import whole_file
 from eval.core.terminal.exits import run_program
 from eval.core.terminal.printing import echo
 from sim.session.truth import read_labels, read_pair_truth

@@ -16,8 +16,8 @@ import pandas as pd
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_json
 from cdpipe.core.names import visible
+from cdpipe.core.whole_file import whole_file
 from cdpipe.training.shard import FIELDS, SUFFIX, read_about, split_of
-from eval.core.output import whole_file
 from eval.plans.splits import version_name
 from eval.plans.worlds import world_slug
 from eval.release.archive import digest_file, write_sums_of

@@ -19,9 +19,10 @@ from pydantic import TypeAdapter
 
 from cdpipe.core import files
 from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.whole_file import whole_file
 from cdpipe.training.shard import FORMAT, FORMAT_VERSION, SUFFIX, read_about
 from eval.core.cluster import HERE, Where, connected, n_slots, require_usable
-from eval.core.output import make_writable, whole_file
+from eval.core.output import make_writable
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.plans.seeds import parse_seeds_option
 from eval.plans.worlds import world_slug

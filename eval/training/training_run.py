@@ -13,6 +13,7 @@ from typing import Any
 import pandas as pd
 import torch
 
+from cdpipe.core.whole_file import whole_file
 from cdpipe.descriptors import use_threads
 from cdpipe.descriptors.change_network import make_untrained_change_network
 from cdpipe.descriptors.devices import find_device
@@ -26,7 +27,7 @@ from cdpipe.training.scan_training import PlaceTask
 from cdpipe.training.sphere_training import SphereTask, read_sphere_data
 from eval.core.charts import BLUE, VERMILLION, Axis, Drawing, Look, Panel, Series
 from eval.core.figures import picture, png
-from eval.core.output import make_writable, whole_file
+from eval.core.output import make_writable
 from eval.core.provenance import git_commit
 from eval.core.terminal.progress import RunProgress
 

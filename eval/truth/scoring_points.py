@@ -22,10 +22,10 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArraySpec, read_npz
 from cdpipe.core.geometry import Float32Array, Int32Array, Int64Array, require_shapes, transform
 from cdpipe.core.geometry.voxel import cell_keys
+from cdpipe.core.whole_file import whole_file
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import Session, chunk_path, read_session
 from cdpipe.model.types import PosedScan
-from eval.core.output import whole_file
 from sim.session.truth import MIXED, Int16Array, read_labels
 
 CELL_M = 0.1

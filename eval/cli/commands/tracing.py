@@ -30,7 +30,8 @@ def trace(
     quiet: Quiet = False,
 ) -> None:
     """Find the centrelines of a tunnel mesh and write a scenario along them: nodes, drifts, routes, one added box."""
-    from eval.core.output import made_parents, whole_file
+    from cdpipe.core.whole_file import whole_file
+    from eval.core.output import made_parents
     from scenarios.schema import MeshFile
     from sim.trace import draft_scenario, format_scenario, save_picture, trace_mesh
 

@@ -22,7 +22,8 @@ import typer
 
 from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.names import visible
-from eval.core.output import make_writable, unwritable, whole_file
+from cdpipe.core.whole_file import whole_file
+from eval.core.output import make_writable, unwritable
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from importlib.resources.abc import Traversable
 
-from cdpipe.core.yamlfile import read_yaml_text
+from cdpipe.core.yamlfile import read_head_comment
 from cdpipe.model.config import preset_files
 from eval.running.results.grids import split_variant
 from eval.tables.columns import Column, spaced
@@ -69,22 +68,12 @@ def index_entries(methods: Sequence[Entry], columns: Sequence[Entry], variants: 
     return found
 
 
-def head_comment(file: Traversable) -> str:
-    """Return the comment at the head of a file on one line, "" where there is none."""
-    head = []
-    for line in read_yaml_text(file).splitlines():
-        if not line.startswith("#"):
-            break
-        head.append(line.lstrip("# "))
-    return " ".join(" ".join(head).split())
-
-
 def _describe_method(name: str) -> str:
     if is_told_the_truth(name):
         parts = [_ORACLES.get(part, part) for part in name.split("+")]
         return f"An upper bound: {' and '.join(parts)}; everything else as tunnelcd."
     file = preset_files().get(name)
-    text = head_comment(file) if file is not None else ""
+    text = read_head_comment(file) if file is not None else ""
     return _shorten(text) if text else "No preset of this tunnelcd: a method of whoever made the run."
 
 

@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import parse_json
 from cdpipe.core.files.json_file import MAX_BYTES
-from eval.core.output import whole_file
+from cdpipe.core.whole_file import whole_file
 from eval.core.provenance import TOOL
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.running.pair_run import Pair

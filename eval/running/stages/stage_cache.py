@@ -23,7 +23,7 @@ import numpy.typing as npt
 import cdpipe
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArrayType, read_npz
-from eval.core.output import whole_file
+from cdpipe.core.whole_file import whole_file
 from eval.core.provenance import digest
 
 MAPS = "maps"

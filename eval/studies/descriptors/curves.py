@@ -26,6 +26,7 @@ from torch import Tensor
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from cdpipe.core.ranking import auroc
+from cdpipe.core.whole_file import whole_file
 from cdpipe.descriptors import use_threads
 from cdpipe.descriptors.sphere_network import (
     SphereNetwork,
@@ -38,7 +39,7 @@ from cdpipe.training.fit import FitConfig, fit
 from cdpipe.training.shard import read_shard
 from cdpipe.training.sphere_training import SphereData, SphereTask, local_scores, pool_within_reach, read_sphere_data
 from eval.core.figures import picture, png
-from eval.core.output import make_writable, whole_file
+from eval.core.output import make_writable
 from eval.core.statistics import mean
 from eval.core.tablefile import read_table
 from eval.core.terminal.exits import run_program

@@ -11,10 +11,10 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.plugins import SEARCH_PATH
+from cdpipe.core.yamlfile import read_head_comment
 from cdpipe.model.config import load_config, preset_files
 from eval.cli.listing import list_entries
 from eval.plans.files import read_plan
-from eval.report.framing.glossary import head_comment
 from scenarios.catalogue import clean_family
 
 Spoil = Callable[[Path], object]
@@ -33,7 +33,7 @@ SPOILED: list[Spoil] = [_no_utf8, _too_large, Path.mkdir]
 if sys.platform != "win32":
     SPOILED.append(os.mkfifo)
 READERS = {
-    "presets": (lambda: load_config("my_own"), lambda: list_entries("presets"), lambda: head_comment(_preset())),
+    "presets": (lambda: load_config("my_own"), lambda: list_entries("presets"), lambda: read_head_comment(_preset())),
     "plans": (lambda: read_plan("my_own"), lambda: list_entries("plans")),
 }
 

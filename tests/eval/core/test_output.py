@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from cdpipe.core.errors import InputError
-from eval.core.output import copy_folder, make_writable, new_files, new_folder, whole_file
+from cdpipe.core.whole_file import whole_file
+from eval.core.output import copy_folder, make_writable, new_files, new_folder
 
 
 def tree(folder: Path) -> list[str]:

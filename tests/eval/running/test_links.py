@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.whole_file import whole_file
 from cdpipe.descriptors.describe import save_descriptors
 from cdpipe.model.config import MapConfig
 from cdpipe.model.types import DescriptorSet
-from eval.core.output import make_writable, new_folder, remove, whole_file
+from eval.core.output import make_writable, new_folder, remove
 from eval.report.page import write_page
 from eval.running.runfolder import open_run_folder, start_run_folder, write_json
 from eval.truth.ground_truth import load_ground_truth
