@@ -28,9 +28,7 @@ from eval.tables.columns import (
     spaced,
 )
 from eval.tables.conditions import condition_of_row, told_apart
-from eval.tables.rows import ALL_DOMAINS, PAIR, is_answered, is_told_the_truth, numbers, records
-
-_AT_RATE = "recall_at_0"  # how columns of recall at a rate of false regions per 100 m begin
+from eval.tables.rows import ALL_DOMAINS, PAIR, is_told_the_truth, numbers, records
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,14 +167,12 @@ def best(values: Sequence[float], column: Column, n_used: Sequence[int] | None =
 def used_pairs(cases: pd.DataFrame, variants: Sequence[str], key: str) -> list[tuple[int, int]]:
     """Return over how many pairs each method has a number in a column of results.csv, and of how many that could have.
 
-    Those that no method has (a pair without changes has no precision) could not. Recall at a rate of false regions is
-    over the path of the answered pairs. Any other figure that is no column of results.csv is over all.
+    Those that no method has (a pair without changes has no precision) could not. A figure that is no column of
+    results.csv is over all.
     """
     has_number = np.ones(len(cases), dtype=np.bool_)
     if key in cases:
         has_number = ~np.isnan(numbers(cases, key))
-    elif key.startswith(_AT_RATE):
-        has_number = is_answered(cases)
     pair = cases.groupby(PAIR, sort=False).ngroup().to_numpy()
     could = np.isin(pair, pair[has_number])
     variant = cases["variant"].to_numpy()

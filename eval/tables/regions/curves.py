@@ -4,9 +4,10 @@ The free-response curve lets the threshold fall over all candidates that were no
 the observable changes found against the false regions per 100 m of after path, over changed and unchanged pairs alike.
 Below a method's own threshold nothing was looked at and nothing withdrawn: there the curve is that of mere proposals.
 Scores of some methods mean something else in a wide drift than in a narrow one, as the radius does, so a threshold
-belongs to one method and one kind of site (`score_radius_m`): at each rate every kind of site has the lowest threshold
-that keeps its own rate.
-A pair without an answer misses all its changes, and its way is not counted.
+belongs to one method and one kind of site (`score_radius_m`): at each rate every kind of site has the best threshold
+of those that keep its own rate.
+A pair with more than ten times the allowed false regions, and more than one, is lost: it misses all its changes and
+counts as so many. A pair without an answer is lost at every threshold, so no refusal raises a recall.
 """
 
 from __future__ import annotations
@@ -30,6 +31,9 @@ _BATCH = 100
 _FIRST_CANDIDATES = 256
 _MAX_ROC_POINTS = 400
 _ROUNDING = 1e-9
+# False regions of a lost pair, as a multiple of those allowed on its way; at least one.
+LOST_AT = 10.0
+_DRAWN_RATES = (0.0, *(float(f"{rate:.2g}") for rate in np.geomspace(0.01, 100.0, 41)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,12 +43,15 @@ class RankedPairs:
     Attributes:
         pairs: (scenario, seed) of each pair, sorted.
         site: (P,) int64 kind of site of each, from 0.
-        path_m: (P,) way of the after session, 0 where there is no answer.
+        path_m: (P,) way of the after session.
+        is_answered: (P,) whether there is an answer.
         n_observable: (P,) int64 observable changes.
         pair: (R,) int64 pair of each candidate.
         score: (R,) its score.
         n_new: (R,) int64 observable changes that it finds and no better candidate of its pair does.
         is_false: (R,) whether it finds no change at all.
+        n_false_so_far: (R,) int64 false ones of its pair that are as good, itself included.
+        n_found_so_far: (R,) int64 observable changes that they and it find.
         change_pair: (C,) int64 pair of each change.
         change_score: (C,) score of the best candidate that finds it, -inf for none.
         change_rank: (C,) int64 place of that candidate in its pair from 0, R for none.
@@ -54,11 +61,14 @@ class RankedPairs:
     pairs: tuple[tuple[str, int], ...]
     site: Int64Array
     path_m: Float64Array
+    is_answered: BoolArray
     n_observable: Int64Array
     pair: Int64Array
     score: Float64Array
     n_new: Int64Array
     is_false: BoolArray
+    n_false_so_far: Int64Array
+    n_found_so_far: Int64Array
     change_pair: Int64Array
     change_score: Float64Array
     change_rank: Int64Array
@@ -102,28 +112,36 @@ def ranked_pairs(
     ranks = np.zeros(len(pairs), np.int64)
     is_told = is_proposal and "found_changes_proposed" in regions  # tables of older runs lack the column
     found_changes = regions["found_changes_proposed" if is_told else "found_changes"].tolist()
-    for candidate in np.lexsort((np.arange(len(scores)), -scores, of_pair)).tolist():
+    order = np.lexsort((np.arange(len(scores)), -scores, of_pair))
+    for candidate in order.tolist():
         pair, found = int(of_pair[candidate]), parsed_ids(found_changes[candidate])
         is_false[candidate] = not found
         new = [i for change in found if (i := number.get((pair, change))) is not None and change_score[i] == -np.inf]
         change_score[new], change_rank[new] = scores[candidate], ranks[pair]
         n_new[candidate] = len(new)
         ranks[pair] += 1
-    is_answered = (cases["status"] == "ok").to_numpy()
     return RankedPairs(
         pairs=tuple(pairs),
         site=np.unique(cases["score_radius_m"].to_numpy(dtype=np.float64), return_inverse=True)[1].astype(np.int64),
-        path_m=np.where(is_answered, cases["after_path_m"].to_numpy(dtype=np.float64), 0.0),
+        path_m=cases["after_path_m"].to_numpy(dtype=np.float64),
+        is_answered=(cases["status"] == "ok").to_numpy(dtype=np.bool_),
         n_observable=cases["n_observable"].to_numpy().astype(np.int64),
         pair=of_pair,
         score=scores,
         n_new=n_new,
         is_false=is_false,
+        n_false_so_far=_so_far(is_false.astype(np.int64), of_pair, order),
+        n_found_so_far=_so_far(n_new, of_pair, order),
         change_pair=np.array([pair for pair, _ in number], dtype=np.int64),
         change_score=change_score,
         change_rank=change_rank,
         change_rows=rows,
     )
+
+
+def _so_far(counts: Int64Array, pair: Int64Array, order: Int64Array) -> Int64Array:
+    """Return (R,) the sum of the counts of each pair from its first candidate in `order` to each."""
+    return pd.Series(counts[order], order).groupby(pair[order]).cumsum().sort_index().to_numpy(dtype=np.int64)
 
 
 def _require_pairs(items: pd.DataFrame, place: Mapping[tuple[str, int], int]) -> None:
@@ -142,29 +160,17 @@ def parsed_ids(value: object) -> tuple[int, ...]:
 
 
 def free_response(ranked: RankedPairs) -> tuple[Float64Array, Float64Array]:
-    """Return the free-response curve.
+    """Return the free-response curve: `recall_at` of 0 and of rates from 0.01 to 100, ten a decade.
 
     Returns:
         (N,) false regions per 100 m, rising from 0, and the (N,) recall at each; a step lies at every point. Both empty
         without an observable change.
     """
-    n_observable = int(ranked.n_observable.sum())
-    if n_observable == 0:
+    if int(ranked.n_observable.sum()) == 0:
         return np.zeros(0), np.zeros(0)
-    ones = np.ones((1, len(ranked.pairs)))
-    steps = []
-    for site in np.unique(ranked.site):
-        n_false, n_found, path_m = (array[0] for array in _cumulated(ranked, int(site), ones)[:3])
-        if path_m > 0:
-            start = np.zeros(1)
-            steps.append((np.append(start, 100.0 * n_false / path_m), np.append(start, n_found)))
-    rates = np.unique(np.concatenate([np.zeros(1), *(rate for rate, _ in steps)]))
-    found = np.zeros(len(rates))
-    for rate, n_found in steps:
-        found += n_found[np.searchsorted(rate, rates + _ROUNDING, side="right") - 1]
-    is_step = np.concatenate([[True], np.diff(found) > 0])
-    is_step[-1] = True  # how far the threshold can fall
-    return rates[is_step], found[is_step] / n_observable
+    recall = np.array([recall_at(ranked, rate) for rate in _DRAWN_RATES])
+    is_step = np.concatenate([[True], np.diff(recall) > 0])
+    return np.array(_DRAWN_RATES)[is_step], recall[is_step]
 
 
 def recall_at(ranked: RankedPairs, rate_per_100m: float) -> float:
@@ -205,15 +211,18 @@ def recall_difference(
 
 def found_at(ranked: RankedPairs, rate_per_100m: float) -> BoolArray:
     """Return (C,) which changes are found at the thresholds of `recall_at`."""
-    ones = np.ones((1, len(ranked.pairs)))
-    thresholds = np.full(int(ranked.site.max(initial=-1)) + 1, np.inf)
-    for site in np.unique(ranked.site):
-        n_false, _, path_m, scores = _cumulated(ranked, int(site), ones)
-        allowed = np.flatnonzero(n_false[0] <= rate_per_100m * path_m[0] / 100.0 + _ROUNDING)
-        if len(allowed):
-            thresholds[site] = scores[allowed[-1]]
-    of_change = thresholds[ranked.site[ranked.change_pair]]
-    return np.asarray((ranked.change_score >= of_change) & np.isfinite(ranked.change_score), dtype=np.bool_)
+    n_pairs = len(ranked.pairs)
+    thresholds = np.full(n_pairs, np.inf)
+    for site in np.unique(ranked.site).tolist():
+        is_allowed, n_found, scores = _at_thresholds(ranked, site, rate_per_100m, np.ones((1, n_pairs)))
+        n_found = np.where(is_allowed, n_found, 0.0)[0]
+        if n_found.any():
+            thresholds[ranked.site == site] = scores[n_found.argmax()]
+    is_false = ranked.is_false & (ranked.score >= thresholds[ranked.pair])
+    n_false = np.bincount(ranked.pair[is_false], minlength=n_pairs)
+    is_kept = ranked.is_answered & (n_false <= _false_of_a_lost_pair(ranked, rate_per_100m))
+    is_found = np.isfinite(ranked.change_score) & (ranked.change_score >= thresholds[ranked.change_pair])
+    return np.asarray(is_found & is_kept[ranked.change_pair], dtype=np.bool_)
 
 
 def roc_curve(scores: Float64Array, is_positive: BoolArray) -> tuple[Float64Array, Float64Array]:
@@ -246,11 +255,10 @@ def roc_curve(scores: Float64Array, is_positive: BoolArray) -> tuple[Float64Arra
 def _recalls(ranked: RankedPairs, rate_per_100m: float, weights: Float64Array) -> Float64Array:
     """Return the (B,) recalls of (B, P) weights of the pairs; NaN where no drawn pair has an observable change."""
     n_found = np.zeros(len(weights))
-    for site in np.unique(ranked.site):
+    for site in np.unique(ranked.site).tolist():
         n_first, n_candidates = _FIRST_CANDIDATES, len(ranked.score)
         while True:
-            n_false, found, path_m, _ = _cumulated(ranked, int(site), weights, n_first)
-            is_allowed = n_false <= (rate_per_100m * path_m / 100.0)[:, None] + _ROUNDING
+            is_allowed, found, _ = _at_thresholds(ranked, site, rate_per_100m, weights, n_first)
             # worse candidates only add false regions
             if n_first >= n_candidates or not is_allowed[:, -1:].any():
                 break
@@ -262,19 +270,36 @@ def _recalls(ranked: RankedPairs, rate_per_100m: float, weights: Float64Array) -
     return recalls
 
 
-def _cumulated(
-    ranked: RankedPairs, site: int, weights: Float64Array, n_first: int | None = None
-) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
+def _at_thresholds(
+    ranked: RankedPairs, site: int, rate_per_100m: float, weights: Float64Array, n_first: int | None = None
+) -> tuple[BoolArray, Float64Array, Float64Array]:
     """Let the threshold fall at one kind of site, over its `n_first` best candidates, all of them by default.
 
     Returns:
-        (B, N) false regions and changes found at each of N thresholds, (B,) way in metres, (N,) thresholds.
+        (B, N) whether each of N thresholds keeps the rate, and the changes found there; (N,) the thresholds.
     """
-    own = np.flatnonzero(ranked.site[ranked.pair] == site)
-    own = own[np.argsort(-ranked.score[own], kind="stable")][:n_first]
+    own = _falling(ranked, site)[:n_first]
     last = last_of_ties(ranked.score[own])
-    drawn = weights[:, ranked.pair[own]]
-    n_false = np.cumsum(drawn * ranked.is_false[own], axis=1)[:, last]
-    n_found = np.cumsum(drawn * ranked.n_new[own], axis=1)[:, last]
-    path_m = weights @ np.where(ranked.site == site, ranked.path_m, 0.0)
-    return n_false, n_found, path_m, ranked.score[own][last]
+    pair, n_false, n_found = ranked.pair[own], ranked.n_false_so_far[own], ranked.n_found_so_far[own]
+    of_lost = _false_of_a_lost_pair(ranked, rate_per_100m)
+    most, n_false_before = of_lost[pair], n_false - ranked.is_false[own]
+    cost = np.minimum(n_false, most) - np.minimum(n_false_before, most)
+    gain = np.where(n_false <= most, n_found, 0) - np.where(n_false_before <= most, n_found - ranked.n_new[own], 0)
+    drawn = weights[:, pair]
+    is_here = ranked.site == site
+    of_refused = weights @ (of_lost * (is_here & ~ranked.is_answered))
+    counted = np.cumsum(drawn * cost, axis=1)[:, last] + of_refused[:, None]
+    allowed = weights @ (rate_per_100m * ranked.path_m * is_here / 100.0)
+    return counted <= allowed[:, None] + _ROUNDING, np.cumsum(drawn * gain, axis=1)[:, last], ranked.score[own][last]
+
+
+def _false_of_a_lost_pair(ranked: RankedPairs, rate_per_100m: float) -> Float64Array:
+    """Return (P,) as how many false regions each pair counts if it is lost."""
+    return np.maximum(LOST_AT * rate_per_100m * ranked.path_m / 100.0 + _ROUNDING, 1.0)
+
+
+@lru_cache(maxsize=64)
+def _falling(ranked: RankedPairs, site: int) -> Int64Array:
+    """Return the candidates of one kind of site, best first."""
+    own = np.flatnonzero(ranked.site[ranked.pair] == site)
+    return own[np.argsort(-ranked.score[own], kind="stable")]

@@ -13,11 +13,11 @@ from matplotlib.image import imread
 from eval.core.charts import BLUE, ORANGE
 from eval.report.maps import RED, RegionMark, TruthMark, distance_map, joined_labels, overlay_map, region_map
 from eval.report.objects.figures import Panel, object_panels, oblique_view
-from eval.report.tables import beside, best, methods_table
+from eval.report.tables import beside, best
 from eval.running.results.grids import find_grids, off_grids, split_variant
 from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
-from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, Column, count, share, significant
+from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, count, significant
 
 HIGH = next(column for column in RESULT_COLUMNS if column.key == "object_iou_point")
 LOW = next(column for column in RESULT_COLUMNS if column.key == "t_total_s")
@@ -200,20 +200,3 @@ def test_no_rule_for_all_screens_undoes_one_for_narrow_screens() -> None:
     selectors = {line.partition("{")[0].strip() for line in narrow.splitlines() if line.strip()}
     later = {line.partition("{")[0].strip() for line in after.partition("@media print")[0].splitlines()}
     assert "dl" in selectors and selectors & later == set()
-
-
-def test_recall_at_a_rate_over_fewer_answered_pairs_is_not_the_best() -> None:
-    """Who refuses the pairs on which it would raise false alarms has a shorter path, and a higher recall at a rate."""
-    pairs = [("s", seed) for seed in (1, 2, 3)]
-    cases = pd.DataFrame([
-        {"scenario": name, "seed": seed, "variant": variant, "domain": "in", "status": status}
-        for variant, last in (("open", "ok"), ("sly", "merge_refused"))
-        for (name, seed), status in zip(pairs, ("ok", "ok", last), strict=True)
-    ])  # fmt: skip
-    table = pd.DataFrame({"domain": "in", "variant": ["open", "sly"], "n_pairs": 3, "recall_at_0.1": [0.7, 0.8]})
-    columns = [Column("recall_at_0.1", "recall", "high", share)]
-    (_, honest), (_, sly) = methods_table(table, columns, cases, "").rows
-    assert (honest[2].is_best, sly[2].is_best) == (False, False)
-    assert (honest[2].interval, sly[2].interval) == ("", "2 of 3 pairs")
-    cases["status"] = "ok"
-    assert [cells[2].is_best for _, cells in methods_table(table, columns, cases, "").rows] == [False, True]

@@ -65,8 +65,8 @@ EVERY = {
 def test_recall_at_every_step(plan: Plan) -> None:
     table = hardness_table(*tables(EVERY), plan).set_index(["axis", "variant", "step"]).sort_index()
     assert table.loc[("height", "tunnelcd"), "recall_at_0.1"].tolist() == [1.0, 0.75, 0.5]
-    # one of two in the pair that was answered, none in the other: a refused pair is not left out
-    assert table.loc[("height", "c2c"), "recall_at_0.1"].tolist() == [1.0, 0.25, 1.0]
+    # a refused pair counts as one false region, and 200 m allow none
+    assert table.loc[("height", "c2c"), "recall_at_0.1"].tolist() == [1.0, 0.0, 1.0]
     assert table.loc[("height", "c2c"), "n_failed"].tolist() == [0, 1, 0]
     assert table.loc[("keyframes", "tunnelcd"), "recall_at_0.1"].tolist() == [0.75, 0.0]
     assert table.loc[("keyframes", "c2c"), "value"].tolist() == [1, 4]
@@ -95,9 +95,9 @@ def test_breaking_points(plan: Plan) -> None:
     # one half is not below one half
     assert points.loc[("height", "tunnelcd"), ["step", "value", "recall"]].tolist() == [0, "", 0.5]
     # broken at the second step, whatever comes after
-    assert points.loc[("height", "c2c"), ["step", "value", "recall"]].tolist() == [2, 0.8, 0.25]
+    assert points.loc[("height", "c2c"), ["step", "value", "recall"]].tolist() == [2, 0.8, 0.0]
     assert points.loc[("keyframes", "tunnelcd"), ["step", "value", "recall"]].tolist() == [2, 4, 0.0]
-    # the answered pair has one half, the refused one nothing: two pairs, of which one failed
+    # draws of the answered pair alone find one half: two pairs, of which one failed
     spread = ["recall_low", "recall_high", "n_judged", "n_failed"]
     assert points.loc[("height", "c2c"), spread].tolist() == [0.0, 0.5, 2, 1]
     assert points["is_measured"].all()
@@ -133,7 +133,7 @@ def test_the_page_says_first_what_breaks_whom(tmp_path: Path, plan: Plan) -> Non
     # what breaks in the scenario as it is breaks on every axis that passes it
     cells = [[(cell.text, cell.interval) for cell in cells] for _, cells in section.table.rows]
     assert cells[0] == [("tunnelcd", ""), ("holds", "0.50"), ("4", "0.00")]
-    assert cells[1] == [("c2c", ""), ("0.8 m", "0.25"), ("1", "0.25")]
+    assert cells[1] == [("c2c", ""), ("0.8 m", "0.00"), ("1", "0.00")]
     assert picture(section.plots[0].drawing)
     page = write_page(run).read_text()
     assert page.index('id="hardness"') < page.index('id="results"')

@@ -24,8 +24,8 @@ from eval.tables.regions.curves import (
 
 CASES = [  # seed, kind of site, status, way, observable changes
     (1, 4.5, "ok", 1000.0, 2),
-    (2, 4.5, "ok", 1000.0, 0),
-    (3, 4.5, "merge_refused", 1000.0, 1),
+    (2, 4.5, "ok", 2000.0, 0),
+    (3, 4.5, "merge_refused", 100.0, 1),
     (4, 10.0, "ok", 500.0, 1),
 ]
 CANDIDATES = [  # seed, score, what it finds
@@ -60,13 +60,30 @@ def by_hand() -> RankedPairs:
 
 
 def test_the_free_response_by_hand() -> None:
-    # narrow: 2 km answered, false regions at 8.5 and 8 (0.05, 0.1 per 100 m), changes at 9 and 7; wide: 500 m, a false
-    # one at 300 (0.2 per 100 m) before the change at 200; the refused pair's change is never found: four in all
+    # narrow: 3.1 km, so 3 false regions at 0.1 per 100 m; the refused pair counts as 1 there (10 times the 0.1 of its
+    # 100 m), as 1 below and as 2 at 0.2; false regions at 8.5 and 8, changes at 9 and 7. Wide: 500 m, a false one at
+    # 300 (0.2 per 100 m) before the change at 200. The refused pair's change is never found: four in all
     rates, recall = free_response(by_hand())
-    np.testing.assert_allclose(rates, [0.0, 0.1, 0.2])
-    np.testing.assert_allclose(recall, [1 / 4, 2 / 4, 3 / 4])
-    found = {rate: recall_at(by_hand(), rate) for rate in (0.0, 0.099, 0.1, 0.2, 5.0)}
-    assert found == {0.0: 0.25, 0.099: 0.25, 0.1: 0.5, 0.2: 0.75, 5.0: 0.75}
+    np.testing.assert_allclose(rates, [0.0, 0.04, 0.1, 0.2])
+    np.testing.assert_allclose(recall, [0.0, 1 / 4, 2 / 4, 3 / 4])
+    found = {rate: recall_at(by_hand(), rate) for rate in (0.0, 0.032, 0.033, 0.096, 0.097, 0.1, 0.199, 0.2, 5.0)}
+    assert list(found.values()) == [0.0, 0.0, 0.25, 0.25, 0.5, 0.5, 0.5, 0.75, 0.75]
+
+
+def test_a_pair_with_too_many_false_regions_is_lost() -> None:
+    # 100 m, 0.1 allowed per 100 m: more than one false region is lost, and counts as one. At 6 both changes of pair 2
+    # would be found, but three false regions of pair 1 count as one, and its change as missed
+    cases = [(1, 4.5, "ok", 100.0, 1), (2, 4.5, "ok", 900.0, 2)]
+    rows = [(1, 9.0, "1"), (1, 8.0, ""), (2, 7.5, "1"), (1, 7.0, ""), (1, 6.5, ""), (2, 6.0, "2")]
+    truth = [(seed, each, True, 20, False, 1.0, 10) for seed, each in ((1, 1), (2, 1), (2, 2))]
+    ranked = ranked_pairs(results(cases), regions(rows), changes(truth))
+    assert recall_at(ranked, 0.1) == 2 / 3
+    assert recall_at(ranked, 0.099) == 1 / 3  # 0.99 allowed
+    assert found_at(ranked, 0.099).tolist() == [True, False, False]
+    # the best threshold, not the lowest: above 7 the change of pair 1 and one of pair 2
+    assert found_at(ranked, 0.1).tolist() == [True, True, False]
+    # ten times 0.31 are three: none is lost, and three are allowed
+    assert recall_at(ranked, 0.31) == 1.0
 
 
 def test_what_was_withdrawn_is_no_candidate_but_was_proposed() -> None:
@@ -75,9 +92,9 @@ def test_what_was_withdrawn_is_no_candidate_but_was_proposed() -> None:
     found = regions()
     gone = found.assign(is_withdrawn=found["score"] == 8.0)
     rates, recall = free_response(ranked_pairs(results(), gone, changes()))
-    np.testing.assert_allclose([rates[1], recall[1]], [0.05, 2 / 4])
-    assert recall_at(ranked_pairs(results(), gone, changes()), 0.05) == 2 / 4
-    assert recall_at(ranked_pairs(results(), gone, changes(), is_proposal=True), 0.05) == 1 / 4
+    np.testing.assert_allclose([rates[2], recall[2]], [0.079, 2 / 4])
+    assert recall_at(ranked_pairs(results(), gone, changes()), 0.065) == 2 / 4
+    assert recall_at(ranked_pairs(results(), gone, changes(), is_proposal=True), 0.065) == 1 / 4
     lost = found.assign(is_withdrawn=found["score"] == 7.0)
     assert recall_at(ranked_pairs(results(), lost, changes()), 10.0) == 2 / 4
     assert recall_at(ranked_pairs(results(), lost, changes(), is_proposal=True), 10.0) == 3 / 4
@@ -102,7 +119,10 @@ def test_a_later_candidate_on_a_found_change_counts_nothing_and_an_unobservable_
     assert ranked.is_false.tolist() == [False, True, False, False, True, True, False]
     assert ranked.change_rank.tolist() == [0, 2, 7, 1]
     assert ranked.change_score.tolist() == [9.0, 7.0, -np.inf, 200.0]
-    assert ranked.path_m.tolist() == [1000.0, 1000.0, 0.0, 500.0]
+    assert ranked.n_false_so_far.tolist() == [0, 1, 1, 1, 1, 1, 1]
+    assert ranked.n_found_so_far.tolist() == [1, 1, 2, 2, 0, 0, 1]
+    assert ranked.path_m.tolist() == [1000.0, 2000.0, 100.0, 500.0]
+    assert ranked.is_answered.tolist() == [True, True, False, True]
     assert found_at(ranked, 0.1).tolist() == [True, True, False, False]
     assert found_at(ranked, 0.2).tolist() == [True, True, False, True]
 
@@ -111,8 +131,8 @@ def test_equal_scores_enter_together() -> None:
     # the false one of the other pair shares the score of the change: both or none
     rows = [(1, 9.0, "1"), (2, 9.0, "")]
     ranked = ranked_pairs(results(), regions(rows), changes())
-    assert (recall_at(ranked, 0.0), recall_at(ranked, 0.05)) == (0.0, 0.25)
-    assert not found_at(ranked, 0.0).any()
+    assert (recall_at(ranked, 0.06), recall_at(ranked, 0.065)) == (0.0, 0.25)
+    assert not found_at(ranked, 0.06).any()
 
 
 def test_without_changes_there_is_no_recall_and_without_candidates_none_is_found() -> None:
@@ -138,9 +158,10 @@ def random_case(seed: int) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
     cases, found, truth = [], [], []
     for pair in range(12):
         n_changes = int(draw.integers(0, 4))
-        cases.append((pair, float(draw.choice([4.5, 10.0])), "ok", float(draw.uniform(50, 300)), n_changes))
+        status = "ok" if pair or not seed % 2 else "merge_refused"
+        cases.append((pair, float(draw.choice([4.5, 10.0])), status, float(draw.uniform(50, 300)), n_changes))
         truth += [(pair, change + 1, True, 20, False, 1.0, 10) for change in range(n_changes)]
-        for _ in range(int(draw.integers(0, 8))):
+        for _ in range(int(draw.integers(0, 8)) if status == "ok" else 0):
             of = [str(change + 1) for change in range(n_changes) if draw.random() < 0.3]
             found.append((pair, float(draw.integers(0, 10)), ";".join(of)))
     return results(cases), regions(found), changes(truth)
@@ -152,11 +173,15 @@ def slow_recall(cases: pd.DataFrame, found: pd.DataFrame, n_observable: int, rat
         best = 0
         candidates = found[found["seed"].isin(own["seed"])]
         for threshold in sorted(set(candidates["score"])):
-            kept = candidates[candidates["score"] >= threshold]
-            if 100 * (kept["found_changes"] == "").sum() / own["after_path_m"].sum() <= rate:
-                hits = {(seed, i) for seed, ids in zip(kept["seed"], kept["found_changes"], strict=True)
-                        for i in ids.split(";") if i}  # fmt: skip
-                best = max(best, len(hits))
+            n_false, n_hits = 0.0, 0
+            for seed, status, path_m in own[["seed", "status", "after_path_m"]].itertuples(index=False):
+                kept = candidates[(candidates["score"] >= threshold) & (candidates["seed"] == seed)]
+                most, n_its_false = max(1.0, rate * path_m / 10.0), int((kept["found_changes"] == "").sum())
+                is_lost = status != "ok" or n_its_false > most
+                n_false += most if is_lost else n_its_false
+                n_hits += 0 if is_lost else len({i for ids in kept["found_changes"] for i in ids.split(";") if i})
+            if n_false <= rate * own["after_path_m"].sum() / 100:
+                best = max(best, n_hits)
         n_found += best
     return n_found / n_observable
 
@@ -166,11 +191,24 @@ def test_recall_agrees_with_a_slow_twin_at_every_rate(seed: int) -> None:
     cases, found, truth = random_case(seed)
     ranked = ranked_pairs(cases, found, truth)
     rates, recall = free_response(ranked)
-    for rate in (0.0, 0.1, 0.5, 1.0, 2.0, 5.0):
+    for rate in (0.0, 0.1, 0.5, 1.0, 2.0, 5.0):  # of the drawn ones
         expected = slow_recall(cases, found, len(truth), rate)
         assert recall_at(ranked, rate) == pytest.approx(expected)
         assert recall[np.searchsorted(rates, rate, side="right") - 1] == pytest.approx(expected)
         assert found_at(ranked, rate).mean() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_refusal_and_no_false_region_raises_a_recall(seed: int) -> None:
+    cases, found, truth = random_case(seed)
+    before = {rate: recall_at(ranked_pairs(cases, found, truth), rate) for rate in (0.1, 0.3, 0.5, 2.0, 10.0)}
+    for pair in cases["seed"]:
+        refused = cases.assign(status=cases["status"].mask(cases["seed"] == pair, "merge_refused"))
+        without = ranked_pairs(refused, found[found["seed"] != pair], truth)
+        assert all(recall_at(without, rate) <= recall for rate, recall in before.items())
+        if (cases["status"][cases["seed"] == pair] == "ok").all():
+            noisier = pd.concat([found, regions([(pair, 5.0, ""), (pair, 9.0, "")])])
+            assert all(recall_at(ranked_pairs(cases, noisier, truth), rate) <= old for rate, old in before.items())
 
 
 def test_draws_are_of_pairs_within_a_kind_of_site_and_the_same_for_every_method() -> None:

@@ -108,7 +108,10 @@ def test_a_row_by_hand() -> None:
     assert (row["n_silent"], row["n_unchanged"], row["silent_share"]) == (1, 3, pytest.approx(1 / 3))
     assert (row["silent_low"], row["silent_high"]) == wilson_interval(1, 3)
     assert (row["bytes_map_before"], row["bytes_regions_before"], row["bytes_ratio"]) == (1000.0, 100.0, 10.0)
-    assert row["recall_at_0.1"] == pytest.approx(2 / 3)
+    # two refusals of six pairs of 1 km each count as 10 false regions at 0.1 per 100 m, and as 50 at 0.5
+    assert (row["recall_at_0.1"], row["recall_at_0.5"]) == (0.0, 0.0)
+    answered = the_row(tables([each for each in rows if each["status"] == "ok"])["regions_table"], "in")
+    assert answered["recall_at_0.1"] == 1.0
     assert row["t_descriptor_per_keyframe_s"] == 0.01
     # nobody keeps less than a byte
     fraction = the_row(tables([changed("regions/narrow", 1, bytes_regions_before=5e-324)])["regions_table"], "in")
