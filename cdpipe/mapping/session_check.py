@@ -19,8 +19,10 @@ _SAMPLED_SCANS = 5
 # Possible and usual median range of a scan, metres.
 _NEAREST_M, _FARTHEST_M = 0.25, 60.0
 _USUAL_M = (0.5, 20.0)
-# Usual distance between neighbouring scans, metres.
+# Usual distance between neighbouring scans, metres. Stations of a tripod lie farther apart, but the way between them
+# takes its time: nobody maps a tunnel faster than this.
 _USUAL_STEP_M = (0.005, 2.0)
+_FASTEST_M_PER_S = 20.0
 # Eigenvalues of the mean outer product of ray directions: one below _FLAT and two above _ROUND give the spin axis.
 _FLAT, _ROUND = 0.12, 0.25
 _MIN_RETURNS = 100
@@ -103,11 +105,20 @@ def _require_metres(source: ScanSource, ranges_m: Float64Array, other: ScanSourc
     steps_m = np.linalg.norm(np.diff(source.odom_T_sensor[:, :3, 3], axis=0), axis=1)
     step_m = float(np.median(steps_m)) if len(steps_m) else 0.0
     reach_m = float(np.quantile(ranges_m, 0.95))
-    if step_m > reach_m:
+    if step_m > reach_m and _speed_m_per_s(source) > _FASTEST_M_PER_S:
         raise InputError(
             f"{source.name}: neighbouring scans lie {step_m:.4g} m apart and see {reach_m:.3g} m far: expected a "
             f"trajectory in metres; {_likely('the trajectory', step_m, _USUAL_STEP_M)}"
         )
+
+
+def _speed_m_per_s(source: ScanSource) -> float:
+    """Return the mean speed from the first to the last scan; infinite where their times tell none."""
+    scans = [source.scan(index) for index in _sampled(len(source.odom_T_sensor))]
+    stamps_ns = [int(scan.stamps_ns.min()) for scan in scans if len(scan.stamps_ns)]
+    way_m = np.linalg.norm(np.diff(source.odom_T_sensor[:, :3, 3], axis=0), axis=1).sum()
+    lasted_s = 1e-9 * (stamps_ns[-1] - stamps_ns[0])
+    return float(way_m / lasted_s) if lasted_s > 0 else np.inf
 
 
 def _likely(what: str, length: float, usual_m: tuple[float, float]) -> str:

@@ -27,10 +27,12 @@ class Drive:
         rays = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
         reach = np.minimum(2.0 / np.abs(rays[:, 1]), 15.0)
         self.clouds = [points * (rays * reach[:, None] + rng.normal(0, 0.01, rays.shape)) for _ in along]
+        self.stamp_s = np.zeros(n_scans)
 
     def scan(self, index: int) -> PosedScan:
         rows = np.arange(len(self.clouds[index]))
-        return PosedScan(index, self.clouds[index], self.odom_T_sensor[index], rows, rows.astype(np.int32))
+        stamps_ns = rows + round(1e9 * self.stamp_s[index])
+        return PosedScan(index, self.clouds[index], self.odom_T_sensor[index], stamps_ns, rows.astype(np.int32))
 
     def scans(self) -> Iterator[PosedScan]:
         return (self.scan(index) for index in range(len(self.clouds)))
@@ -101,6 +103,16 @@ def test_a_trajectory_in_another_unit_than_the_points() -> None:
     # steps of 50: of 5 cm, half a metre, or 1.3 m
     text = said(Drive(trajectory=100.0))
     assert "scale by 0.001 or 0.01 or 0.0254" in text
+
+
+@pytest.mark.parametrize(("apart_s", "passes"), [(60.0, True), (3.0, True), (0.1, False), (0.0, False)])
+def test_stations_of_a_tripod_pass_if_the_way_between_them_took_its_time(apart_s: float, passes: bool) -> None:
+    survey = Drive(trajectory=40.0)  # 20 m apart; scans reach 15 m
+    survey.stamp_s = apart_s * np.arange(12)
+    if passes:
+        check_session(survey, MapConfig())
+    else:
+        assert "neighbouring scans lie 20 m apart" in said(survey)
 
 
 def test_z_is_up() -> None:
