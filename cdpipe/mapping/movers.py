@@ -4,6 +4,9 @@ A thing that stands is hit by most keyframes that see its place. A person who wa
 see the rock behind. So a map point is a mover's if more keyframes of its own session saw through it than hit it, and if
 many such points lie together. Removert and DUFOMap (`cdpipe/methods/RIVALS.md`) clean maps by the same evidence.
 
+Water mirrors: a scan that sees the roof in a puddle sees through the floor. So points that lie on one level sheet are
+no mover's.
+
 What stands still for as long as the robot looks at it is not told.
 """
 
@@ -26,6 +29,9 @@ _LEAST_POINTS, _OF_CELLS_M = 60, 0.2
 _LINK_CELLS = 2.0
 # The stricter kind was seen through by so many keyframes, and so many times as many as hit it; the other by more.
 _STRICT_THROUGH, _STRICT_FACTOR, _LEAST_THROUGH = 3, 2, 2
+# A sheet: the middle 90 % of the stricter points within this thickness, their plane within this angle of level. Floors
+# under water (`water/null` 10005 and 10006) are 0.07 to 0.12 m thick.
+_SHEET_M, _LEVEL = 0.3, np.cos(np.deg2rad(20.0))
 # Points are held against the keyframes around their block.
 _BLOCK_M = 8.0
 _BLOCK_RETURNS = 1 << 22
@@ -62,8 +68,19 @@ def find_movers(points_odom: Float64Array, views: KeyframeViews, voxel_m: float)
     found = np.flatnonzero(is_mover)
     labels, sizes = label_groups(points_odom[found], _LINK_CELLS * voxel_m)
     n_strict = np.bincount(labels, is_strict[found], len(sizes))
-    is_mover[found] = n_strict[labels] >= _LEAST_POINTS * (_OF_CELLS_M / voxel_m) ** 2
+    is_group = n_strict >= _LEAST_POINTS * (_OF_CELLS_M / voxel_m) ** 2
+    for label in np.flatnonzero(is_group):
+        is_group[label] = not _is_level_sheet(points_odom[found[(labels == label) & is_strict[found]]])
+    is_mover[found] = is_group[labels]
     return is_mover
+
+
+def _is_level_sheet(points_odom: Float64Array) -> bool:
+    """Return whether (N, 3) points lie on one level plane, as a floor does."""
+    centred = points_odom - points_odom.mean(axis=0)
+    normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]
+    low_m, high_m = np.quantile(centred @ normal, (0.05, 0.95))
+    return bool(abs(normal[2]) > _LEVEL and high_m - low_m < _SHEET_M)
 
 
 def _count(points_odom: Float64Array, views: KeyframeViews) -> tuple[Int64Array, Int64Array]:
