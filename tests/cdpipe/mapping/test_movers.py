@@ -95,6 +95,34 @@ def test_what_comes_for_a_moment_is_dropped_and_what_leaves_for_a_moment_stays()
     assert drop_movers(away) is away
 
 
+class Pool(Room):
+    """The empty room with a floor 1.5 m below the sensor; all scans but two see the roof mirrored in a puddle.
+
+    The floor rises by `leans` along -y.
+    """
+
+    def __init__(self, leans: float = 0.0) -> None:
+        super().__init__({})
+        self._leans = leans
+
+    def scan(self, index: int) -> PosedScan:
+        scan = super().scan(index)
+        down = -RAYS[:, 2] - self._leans * RAYS[:, 1]
+        floor_m, range_m = 1.5 / np.maximum(down, 1e-3), np.linalg.norm(scan.points_sensor, axis=1)
+        feet = scan.odom_T_sensor[:3, 3] + floor_m[:, None] * RAYS
+        mirrors = (np.hypot(feet[:, 0], feet[:, 1] - 4.0) < 2.0) & (index not in (5, 6))
+        is_floor = (floor_m < range_m) & ~mirrors
+        return replace(scan, points_sensor=np.where(is_floor, floor_m, range_m)[:, None] * RAYS)
+
+
+def test_a_floor_under_water_stays_and_a_leaning_sheet_that_comes_and_goes_does_not() -> None:
+    wet = build_map(Pool(), CONFIG)
+    assert np.count_nonzero(np.abs(wet.points[:, 2] + 1.5) < 0.1) > 500
+    assert drop_movers(wet) is wet
+    leaning = build_map(Pool(leans=0.7), CONFIG)
+    assert len(drop_movers(leaning).points) < len(leaning.points) - 100
+
+
 def test_returns_go_with_their_points(monkeypatch: pytest.MonkeyPatch) -> None:
     kept = mapped(WALKS)
     left = drop_movers(kept)
