@@ -9,7 +9,7 @@ others 2018).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -135,7 +135,7 @@ def drop_airborne(scan: PosedScan, lies_on_surface: LiesOnSurface | None = None)
     if lies_on_surface is not None:
         marked = np.flatnonzero(~kept)
         kept[marked[lies_on_surface(scan, marked)]] = True
-    return scan.keep(kept)
+    return replace(scan.keep(kept), airborne_sensor=scan.points_sensor[~kept])
 
 
 def _mark(scan: PosedScan, signal: npt.NDArray[np.uint16], rule: _Rule) -> BoolArray:

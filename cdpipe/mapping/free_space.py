@@ -28,13 +28,20 @@ _CELL_M = 0.1
 _PAST_M = (0.1, 1.0)
 
 
-def render_view(points_sensor: Float64Array) -> Float16Array:
+def render_view(points_sensor: Float64Array, airborne_sensor: Float64Array | None = None) -> Float16Array:
     """Return the (ROWS, COLUMNS) float16 range image: nearest return of each pixel, metres, 0 without one.
+
+    A pixel that holds returns of mist or dust alone has the nearest of them. Some are of dark rock, and what the rays
+    beside it see is no sign that they passed it.
 
     Args:
         points_sensor: (N, 3) returns of a scan, sensor frame, metres.
+        airborne_sensor: (D, 3) those that were left out as mist or dust.
     """
-    return nearest_image(*_pixels(points_sensor), (ROWS, COLUMNS)).astype(np.float16)
+    view = nearest_image(*_pixels(points_sensor), (ROWS, COLUMNS))
+    if airborne_sensor is not None:
+        view = np.where(view == 0, nearest_image(*_pixels(airborne_sensor), (ROWS, COLUMNS)), view)
+    return view.astype(np.float16)
 
 
 def free_space_votes(points_odom: Float64Array, views: KeyframeViews) -> Int64Array:

@@ -126,7 +126,7 @@ class _MapAccumulator:
         self._return_pixels.append(scan.pixels.take(near))
         self._n_returns.append(len(near))
         if scan.index in self._keyframe_scans:
-            self._views.append(render_view(scan.points_sensor))
+            self._views.append(render_view(scan.points_sensor, scan.airborne_sensor))
         in_cells = points / voxel_m
         in_cells -= np.floor(in_cells)
         in_cells *= PLACES

@@ -43,6 +43,7 @@ class PosedScan:
         signal: (N,) uint16 photons of each return, None where the sensor does not tell.
         second_from: Pixels from this one on are second returns of the beams from pixel 0 on; None: one return a beam.
         intensity: (N,) float32 intensity of each return in the recording's own unit, None where it has none.
+        airborne_sensor: (D, 3) returns that were left out as mist or dust; None where the air is clear.
     """
 
     index: int
@@ -53,6 +54,7 @@ class PosedScan:
     signal: npt.NDArray[np.uint16] | None = None
     second_from: int | None = None
     intensity: Float32Array | None = None
+    airborne_sensor: Float64Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.points_sensor)

@@ -15,9 +15,10 @@ from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
 from cdpipe.mapping import airborne
 from cdpipe.mapping.airborne import ClearScans, LiesOnSurface, clear_air, drop_airborne
+from cdpipe.mapping.free_space import free_space_votes, render_view
 from cdpipe.mapping.mapping import build_map
 from cdpipe.model.config import MapConfig, load_config
-from cdpipe.model.types import PosedScan, WrappedScans
+from cdpipe.model.types import KeyframeViews, PosedScan, WrappedScans
 from scenarios import load_scenario
 from sim.sensor.air import AIR
 from sim.session.simulate import simulate_pair
@@ -60,6 +61,7 @@ def test_weak_returns_in_front_of_a_wall_are_dropped() -> None:
     assert left.signal is not None and len(left.points_sensor) == len(left.stamps_ns) == len(left.signal) == 94
     kept = np.isin(scan.pixels, left.pixels)
     assert (left.points_sensor == scan.points_sensor[kept]).all() and (left.stamps_ns == scan.stamps_ns[kept]).all()
+    assert left.airborne_sensor is not None and (left.airborne_sensor == scan.points_sensor[~kept]).all()
 
 
 def test_strong_returns_and_surfaces_stay() -> None:
@@ -81,6 +83,20 @@ def test_what_is_near_and_nearly_black_is_mist_though_it_looks_like_a_surface() 
     assert dropped(scan_of(ranges_m, signal)) == MIST
     dark = scan_of(np.full(WIDTH, 1.5), np.full(WIDTH, 8))
     assert drop_airborne(dark) is dark  # nothing would be left
+
+
+def test_a_place_from_which_returns_were_dropped_was_not_seen_through() -> None:
+    # a dark patch of the wall, twenty beams wide and as rough as mist, is dropped; the wall behind it goes on at 7 m
+    ranges_m, signal = np.full(WIDTH, 7.0), np.full(WIDTH, 60, np.int32)
+    ranges_m[40:60], signal[40:60] = 4.0 + 0.5 * (np.arange(20) % 3), 9
+    scan = drop_airborne(scan_of(ranges_m, signal))
+    assert len(scan.points_sensor) == WIDTH - 20 and scan.airborne_sensor is not None
+    patch = scan.airborne_sensor
+    images = [render_view(scan.points_sensor, airborne) for airborne in (None, patch)]
+    votes = [free_space_votes(patch, KeyframeViews(image[None], np.eye(4)[None])) for image in images]
+    assert votes[0].max() == 1 and votes[1].max() == 0
+    # a kept return of the same pixel decides: here the mist in front of it was dropped
+    assert np.array_equal(render_view(scan.points_sensor, 0.5 * scan.points_sensor), images[0])
 
 
 def test_only_a_dusty_scan_loses_returns() -> None:
