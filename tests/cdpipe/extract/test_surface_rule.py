@@ -146,6 +146,7 @@ def test_what_only_scans_from_afar_show_is_no_change_where_the_session_came_near
     session: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cdpipe.extract.surface_rule, "_DOUBLED", np.inf)  # as from near
+    monkeypatch.setattr(cdpipe.extract.surface_rule, "_ON_ITS_WAY", np.inf)
     right = in_the_hall((*DOWN_THE_HALL, *PATH))
     off = in_the_hall((*DOWN_THE_HALL, *PATH), len(DOWN_THE_HALL), -1.2)
     assert both_ways(session, off, right) == []
@@ -170,6 +171,43 @@ def test_a_thing_seen_mostly_from_afar_is_a_change_all_the_same(path: Sequence[t
     assert iou(found, after[0].returns_on(0)) > 0.7
     ranges_m = [np.linalg.norm(after[0].scan(scan).points_sensor[pixel]) for scan, pixel in found]
     assert np.mean(np.array(ranges_m) > 15.0) > 0.5
+
+
+class Passing(RoomScans):
+    """A room in which a crate stands while some scans are taken, and is gone in the others."""
+
+    def __init__(self, scans: Sequence[int], path: Sequence[tuple[float, float, float]]) -> None:
+        super().__init__((), 2, path)
+        self._with, self._scans = RoomScans((CRATE,), 2, path), scans
+
+    def scan(self, index: int) -> PosedScan:
+        return self._with.scan(index) if index in self._scans else super().scan(index)
+
+
+ALONG = tuple((x, 0.0, 1.5) for x in np.arange(-2.0, 2.5, 0.5).tolist())
+
+
+@pytest.mark.parametrize("session", ["before", "after"])
+def test_a_crate_that_a_third_of_the_scans_saw_through_is_no_change(session: str) -> None:
+    for seen, is_change in ((range(9), True), (range(8), True), (range(4), False), ((4,), False)):
+        passing = Passing(seen, ALONG)
+        assert bool(both_ways(session, (passing, passing.mapped()), scanned((), 1))) == is_change, seen
+
+
+@pytest.mark.parametrize(
+    ("seen", "n_scans", "apart_m", "is_fleeting"),
+    [
+        ([5], 20, 0.5, True), ([5, 6, 6], 20, 0.5, True), ([5, 6, 7], 20, 0.5, False), ([5, 7], 20, 0.5, True),
+        ([0], 20, 0.5, True), ([19], 20, 0.5, True), ([5], 20, 10.0, False), ([0, 1], 2, 0.5, False),
+        ([0], 1, 0.5, False), ([2], 20, 0.0, True), ([5, 15], 20, 0.5, False),
+    ],
+)  # fmt: skip
+def test_one_or_two_scans_between_near_ones_are_fleeting(
+    seen: list[int], n_scans: int, apart_m: float, is_fleeting: bool
+) -> None:
+    poses = np.tile(np.eye(4), (n_scans, 1, 1))
+    poses[:, 0, 3] = apart_m * np.arange(n_scans)
+    assert cdpipe.extract.surface_rule._is_fleeting(poses, np.array(seen)) == is_fleeting
 
 
 @pytest.mark.parametrize("n_again", [3, 5, 7])
