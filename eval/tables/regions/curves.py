@@ -32,7 +32,7 @@ _FIRST_CANDIDATES = 256
 _MAX_ROC_POINTS = 400
 _ROUNDING = 1e-9
 # False regions of a lost pair, as a multiple of those allowed on its way; at least one.
-LOST_AT = 10.0
+_LOST_AT = 10.0
 _DRAWN_RATES = (0.0, *(float(f"{rate:.2g}") for rate in np.geomspace(0.01, 100.0, 41)))
 
 
@@ -295,7 +295,7 @@ def _at_thresholds(
 
 def _false_of_a_lost_pair(ranked: RankedPairs, rate_per_100m: float) -> Float64Array:
     """Return (P,) as how many false regions each pair counts if it is lost."""
-    return np.maximum(LOST_AT * rate_per_100m * ranked.path_m / 100.0 + _ROUNDING, 1.0)
+    return np.maximum(_LOST_AT * rate_per_100m * ranked.path_m / 100.0 + _ROUNDING, 1.0)
 
 
 @lru_cache(maxsize=64)
