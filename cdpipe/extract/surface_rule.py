@@ -222,18 +222,23 @@ def _is_out_of_place(point_map: PointMap, returns: Int64Array) -> bool:
         return True
     places, _ = cell_means(points, CELL_M)
     path_m = travelled_m(point_map.odom_T_sensor)
-    off_m, _ = cKDTree(path_m[np.unique(scans), None]).query(path_m[point_map.keyframe_scans, None])
-    near = np.flatnonzero(off_m <= _PASS_M)
-    views = KeyframeViews(point_map.views.ranges_m[near], point_map.views.sensor_T_odom[near])
-    n_through, n_hit = (counts.sum() for counts in count_through_and_hit(places, views))
+    off_m = np.asarray(cKDTree(path_m[np.unique(scans), None]).query(path_m[point_map.keyframe_scans, None])[0])
+    n_through, n_hit = _count(places, point_map.views, off_m <= _PASS_M)
     if n_through > _ON_ITS_WAY * n_hit:
         return True
-    n_through, n_hit = (counts.sum() for counts in count_through_and_hit(places, point_map.views))
+    n_through_away, n_hit_away = _count(places, point_map.views, off_m > _PASS_M)
     is_far = np.linalg.norm(points - point_map.odom_T_sensor[scans, :3, 3], axis=1) > REACH_M
     # weighted by path length, because the scans of a robot at rest are redundant
     way_m = np.diff(path_m, prepend=0.0)[scans]
     is_afar = way_m[is_far].sum() > way_m[~is_far].sum()
-    return bool(n_through > (_DOUBLED_AFAR if is_afar else _DOUBLED) * n_hit)
+    return n_through + n_through_away > (_DOUBLED_AFAR if is_afar else _DOUBLED) * (n_hit + n_hit_away)
+
+
+def _count(places: Float64Array, views: KeyframeViews, is_chosen: BoolArray) -> tuple[int, int]:
+    """Return how often the chosen ones of the (K,) keyframes saw through the (N, 3) places, and how often they hit."""
+    chosen = KeyframeViews(views.ranges_m[is_chosen], views.sensor_T_odom[is_chosen])
+    n_through, n_hit = count_through_and_hit(places, chosen)
+    return int(n_through.sum()), int(n_hit.sum())
 
 
 def _is_fleeting(odom_T_sensor: Float64Array, scans: Int64Array) -> bool:
