@@ -1,7 +1,7 @@
 """The sphere descriptor: 64 numbers for the map around a keyframe, and the log-odds that it has changed.
 
-The before descriptors are computed while mapping, from the before map alone. After the merge the after map is rendered
-at the before keyframes. The log-odds of a keyframe are the maximum over its sectors.
+The descriptors are computed while mapping, from the map of one session alone. After the merge the map of the other is
+rendered at its keyframes. The log-odds of a keyframe are the maximum over its sectors.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from cdpipe.descriptors.sphere_network import (
 )
 from cdpipe.descriptors.weights_file import digest, read_weights
 from cdpipe.model.config import DescriptorConfig, SphereConfig
-from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap, Spheres
+from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap, SessionName, Spheres
 
 _BATCH = 64
 _INT8_SCALE = 127.0
@@ -65,29 +65,36 @@ def describe_map(
 
 
 def change_logits(
-    merged: MergedMaps, before: DescriptorSet, is_covered: BoolArray, sphere: SphereConfig = _SHIPPED
+    merged: MergedMaps,
+    described: DescriptorSet,
+    is_covered: BoolArray,
+    sphere: SphereConfig = _SHIPPED,
+    session: SessionName = "before",
 ) -> Float64Array:
-    """Return the (K, SECTORS) log-odds of change of each sector of each before keyframe.
+    """Return the (K, SECTORS) log-odds of change of each sector of each keyframe of a session.
 
-    Keyframe poses are transformed into the after odom frame by the local alignment; the after map stays in place.
+    Keyframe poses are transformed into the odom frame of the other session by the local alignment; its map stays in
+    place.
 
     Args:
         merged: Both maps.
-        before: Its `spheres` are compared.
-        is_covered: (K,) whether the after session came near a keyframe; the others get NaN.
-        sphere: The frames and the weights with which the before map was described.
+        described: The session; its `spheres` are compared.
+        is_covered: (K,) whether the other session came near a keyframe; the others get NaN.
+        sphere: The frames and the weights with which the map was described.
+        session: Which session it is.
 
     Raises:
-        ValueError: The before session has no sphere descriptors.
+        ValueError: The session has no sphere descriptors.
         InputError: The file of weights cannot be used.
     """
-    if before.spheres is None:
-        raise ValueError("the before session has no sphere descriptors: describe its map")
+    if described.spheres is None:
+        raise ValueError(f"the {session} session has no sphere descriptors: describe its map")
     network, _ = _network(sphere)
+    other: SessionName = "after" if session == "before" else "before"
     logits = np.full((len(is_covered), SECTORS), np.nan)
-    map_T_anchor = anchor_frames(merged.before, before.keyframe_scans[is_covered], sphere)
-    images = render(GridIndex(merged.after.points), merged.move_poses("before", "after", map_T_anchor))
-    spheres = dequantise(before.spheres[is_covered])
+    odom_T_anchor = anchor_frames(merged.map_of(session), described.keyframe_scans[is_covered], sphere)
+    images = render(GridIndex(merged.map_of(other).points), merged.move_poses(session, other, odom_T_anchor))
+    spheres = dequantise(described.spheres[is_covered])
     with torch.inference_mode():
         batches = (torch.split(torch.from_numpy(array), _BATCH) for array in (spheres, images))
         parts = [
@@ -99,15 +106,19 @@ def change_logits(
 
 
 def change_log_odds(
-    merged: MergedMaps, before: DescriptorSet, is_covered: BoolArray, sphere: SphereConfig = _SHIPPED
+    merged: MergedMaps,
+    described: DescriptorSet,
+    is_covered: BoolArray,
+    sphere: SphereConfig = _SHIPPED,
+    session: SessionName = "before",
 ) -> Float64Array:
-    """Return the (K,) calibrated log-odds of change around each before keyframe; NaN if not covered.
+    """Return the (K,) calibrated log-odds of change around each keyframe of a session; NaN if not covered.
 
     Their sigmoid is a probability, calibrated on validation tunnels. Arguments as of `change_logits`.
     """
     log_odds = np.full(len(is_covered), np.nan)
-    logits = change_logits(merged, before, is_covered, sphere)[is_covered]
-    positions = merged.before.odom_T_sensor[before.keyframe_scans[is_covered], :3, 3]
+    logits = change_logits(merged, described, is_covered, sphere, session)[is_covered]
+    positions = merged.map_of(session).odom_T_sensor[described.keyframe_scans[is_covered], :3, 3]
     most_changed = torch.from_numpy(average_neighbours(logits, positions).max(axis=1))
     log_odds[is_covered] = _network(sphere)[0].calibrate(most_changed).numpy()
     return log_odds

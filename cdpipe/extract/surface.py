@@ -50,8 +50,8 @@ _FULL_RETURNS, _DENSE_M = 3, 0.2
 # Where two parts meet, cells within `_SEAM_M` of the other part hold mixed returns: fewer to a cell than the parts do,
 # this share at most. A surface that the sensor sampled thinly has no such seam.
 _SEAM_M, _SEAM_SHARE = 0.1, 0.75
-# Least number of scans with a grazing ray through a cell.
-_MIN_SCANS_PAST = 3
+# Least number of scans with a grazing ray through a cell of a low object.
+MIN_SCANS_PAST = 3
 # Least size of a low object: 0.25 m^2 in cells of 0.05 m. As so many cells must agree, those on a floor may be nearer
 # to it than seeds of other objects: as far as candidates, or this many times the noise.
 _MIN_LOW_CELLS = 100
@@ -257,7 +257,7 @@ def unassigned_cells(site: Site, taken: list[Int64Array], noise_m: float, config
 
 
 def add_low_objects(
-    site: Site, left: Int64Array, n_past: Int64Array, taken: list[Int64Array], noise_m: float, config: ExtractConfig
+    site: Site, left: Int64Array, is_passed: BoolArray, taken: list[Int64Array], noise_m: float, config: ExtractConfig
 ) -> list[Int64Array]:
     """Return the cells of each object of a site: those found so far, and what grazing rays reveal besides.
 
@@ -268,13 +268,12 @@ def add_low_objects(
     Args:
         site: The cells.
         left: (L,) cells of the site to consider, from `unassigned_cells`.
-        n_past: (L,) scans of the other session with a grazing ray through each cell.
+        is_passed: (L,) whether enough scans of the other session have a grazing ray through each cell.
         taken: Cells of the objects found so far.
         noise_m: Median distance of the two surfaces in the region, metres.
         config: Thresholds.
     """
     is_clear = _is_clear_if_low(site, noise_m, config)
-    is_passed = n_past >= _MIN_SCANS_PAST
     core, foot = left[is_passed], left[~is_passed]
     labels, sizes = label_groups(site.points[core], _LINK_M)
     n_clear = np.bincount(labels[is_clear[core]], minlength=len(sizes))

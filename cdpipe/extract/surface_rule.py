@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform, travelled_m
 from cdpipe.core.geometry.groups import label_groups
 from cdpipe.core.geometry.voxel import cell_means
 from cdpipe.extract.crops import DIRECTIONS, SESSIONS, Crops, Sphere
 from cdpipe.extract.objects import PointGroup, ReturnPool
+from cdpipe.extract.presence import keep_what_stands
 from cdpipe.extract.surface import (
-    CELL_M,
+    MIN_SCANS_PAST,
     RIM_M,
     SITE_M,
     SURFACE_CELL_M,
@@ -32,11 +32,11 @@ from cdpipe.extract.surface import (
     measure_noise_m,
     unassigned_cells,
 )
-from cdpipe.mapping.free_space import REACH_M, count_through_and_hit, free_space_votes, grazing_ray_count
+from cdpipe.mapping.free_space import free_space_votes, grazing_ray_count
 from cdpipe.merge.registration import MIN_SPHERE_POINTS, Surface, align_to_planes
 from cdpipe.model.config import ExtractConfig
 from cdpipe.model.report import ChangeRegions
-from cdpipe.model.types import KeyframeViews, MergedMaps, PointMap, SessionName
+from cdpipe.model.types import MergedMaps, PointMap, SessionName
 
 # Margin of a sphere: an object that starts inside the sphere is followed this far beyond it.
 BEYOND_M = 1.5
@@ -47,15 +47,8 @@ _MAX_SHIFT_M = 0.4
 _MIN_TELLING = 2
 # Height above the surface below which a range image cannot show free space.
 _LOW_M = 0.3
-# Ratio of seen-through to hit by its own session above which a surface is a double caused by drift, and above which it
-# is one if it was mostly seen from afar.
-_DOUBLED, _DOUBLED_AFAR = 3.0, 0.4
-# The same by keyframes within this way of those that hit it, above which it was on its way. Validation seeds 10010 and
-# 10011: 0.45 at most for railings and chairs of `paper/site1`, 0.36 for the objects of eight other families; up to 1.2
-# for what maps keep of people and trucks that move.
-_ON_ITS_WAY, _PASS_M = 0.6, 5.0
-# What passes is hit by so few scans, though their neighbours within this way would see it, too.
-_FLEETING_SCANS, _FLEETING_M = 2, 2.0
+# Keyframes and scans that lie farther apart than this stand for several.
+_VIEW_M = 3.0
 _UNKNOWN_VIEWS = np.int64(1 << 20)
 
 
@@ -95,7 +88,7 @@ def cut_by_surface(merged: MergedMaps, regions: ChangeRegions, config: ExtractCo
             continue
         agreements[region], of_region = _compare_region(merged, spheres, regions.centres_map[region], region, config)
         found += of_region
-    return _cut_sites(merged, _find_sites(merged, crops, found, agreements), config)
+    return keep_what_stands(merged, _cut_sites(merged, _find_sites(merged, crops, found, agreements), config), config)
 
 
 def _compare_region(
@@ -180,6 +173,7 @@ def _cut_sites(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) ->
         name: ReturnPool(merged.map_of(name), [site.own if site.session == name else site.others for site in sites])
         for name in SESSIONS
     }
+    asked = {name: _ask_for_views(merged.map_of(name), config) for name in SESSIONS}
     result = []
     for site in sites:
         other: SessionName = "before" if site.session == "after" else "after"
@@ -192,13 +186,11 @@ def _cut_sites(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) ->
         n_views = _free_space_votes(compared.points, merged, other, correction)
         rays = partial(collect_rays, merged, other, returns[other], points[other], correction)
         noise_m = measure_noise_m(compared, site.agreement.noise_m)
-        for cells in find_object_cells(compared, n_views, rays, noise_m, config):
+        for cells in find_object_cells(compared, n_views, rays, noise_m, *asked[other]):
             is_member = np.zeros(len(compared.points), dtype=np.bool_)
             is_member[cells] = True
             of_object = is_member[compared.cell_of_return]
             chosen = returns[site.session][of_object]
-            if _is_out_of_place(own_map, chosen):
-                continue
             # the answer uses the merge's map frame, without the correction
             in_map = (points["before"] if site.session == "before" else after_map)[of_object]
             indices = np.unique(own_map.return_points[chosen]).astype(np.int64)
@@ -207,50 +199,29 @@ def _cut_sites(merged: MergedMaps, sites: list[_Site], config: ExtractConfig) ->
     return result
 
 
-def _is_out_of_place(point_map: PointMap, returns: Int64Array) -> bool:
-    """Return whether returns are of nothing that stands there, according to their own session.
+def _ask_for_views(point_map: PointMap, config: ExtractConfig) -> tuple[ExtractConfig, int]:
+    """Return the settings, and the least scans past a low object, of which a session can have the evidence.
 
-    A wall that is seen twice, after drift or from far away, can be doubled in the map. Its own session then sees
-    through it too: over `_DOUBLED` times as often as keyframes hit it, or over `_DOUBLED_AFAR` times if most of the
-    returns, weighted by path length, were seen from over 15 m. What moves leaves some points where `drop_movers` finds
-    too few: keyframes that follow those that hit it see through it.
+    A tripod that stands every 10 m looks at a place from there alone, where a robot passes it with 25 keyframes.
     """
-    if point_map.views is None:
-        return False
-    points, scans = point_map.positions_of(returns), point_map.scans_of(returns)
-    if _is_fleeting(point_map.odom_T_sensor, scans):
-        return True
-    places, _ = cell_means(points, CELL_M)
-    path_m = travelled_m(point_map.odom_T_sensor)
-    off_m = np.asarray(cKDTree(path_m[np.unique(scans), None]).query(path_m[point_map.keyframe_scans, None])[0])
-    n_through, n_hit = _count(places, point_map.views, off_m <= _PASS_M)
-    if n_through > _ON_ITS_WAY * n_hit:
-        return True
-    n_through_away, n_hit_away = _count(places, point_map.views, off_m > _PASS_M)
-    is_far = np.linalg.norm(points - point_map.odom_T_sensor[scans, :3, 3], axis=1) > REACH_M
-    # weighted by path length, because the scans of a robot at rest are redundant
-    way_m = np.diff(path_m, prepend=0.0)[scans]
-    is_afar = way_m[is_far].sum() > way_m[~is_far].sum()
-    return n_through + n_through_away > (_DOUBLED_AFAR if is_afar else _DOUBLED) * (n_hit + n_hit_away)
+    scans, keyframes = point_map.odom_T_sensor, point_map.odom_T_sensor[point_map.keyframe_scans]
+    min_views = config.min_views / _count_views(keyframes)
+    return config.model_copy(update={"min_views": min_views}), round(MIN_SCANS_PAST / _count_views(scans))
 
 
-def _count(places: Float64Array, views: KeyframeViews, is_chosen: BoolArray) -> tuple[int, int]:
-    """Return how often the chosen ones of the (K,) keyframes saw through the (N, 3) places, and how often they hit."""
-    chosen = KeyframeViews(views.ranges_m[is_chosen], views.sensor_T_odom[is_chosen])
-    n_through, n_hit = count_through_and_hit(places, chosen)
-    return int(n_through.sum()), int(n_hit.sum())
-
-
-def _is_fleeting(odom_T_sensor: Float64Array, scans: Int64Array) -> bool:
-    """Return whether the (N,) scans are one or two of the session's (S, 4, 4), with others around them."""
-    seen = np.unique(scans)
-    around = odom_T_sensor[max(seen[0] - 1, 0) : seen[-1] + 2]
-    has_others = len(seen) <= _FLEETING_SCANS and len(around) > len(seen)
-    return has_others and bool(travelled_m(around)[-1] <= _FLEETING_M)
+def _count_views(odom_T_sensor: Float64Array) -> float:
+    """Return how many views one of (K, 4, 4) poses stands for: one for every 3 m between them, 1 to 3."""
+    step_m = np.diff(travelled_m(odom_T_sensor))
+    return float(np.clip(np.median(step_m) / _VIEW_M, 1.0, MIN_SCANS_PAST)) if len(step_m) else 1.0
 
 
 def find_object_cells(
-    site: Site, n_views: Int64Array, rays: Callable[[], Rays], noise_m: float, config: ExtractConfig
+    site: Site,
+    n_views: Int64Array,
+    rays: Callable[[], Rays],
+    noise_m: float,
+    config: ExtractConfig,
+    min_scans: int = MIN_SCANS_PAST,
 ) -> list[Int64Array]:
     """Return the cells of each object of a site: objects found by range images, then low objects by grazing rays.
 
@@ -260,12 +231,14 @@ def find_object_cells(
         rays: Returns the rays of the other session; called only if cells are left for low objects.
         noise_m: Median distance of the two surfaces in the region, metres.
         config: Thresholds.
+        min_scans: Least number of scans of the other session with a grazing ray through a cell of a low object.
     """
     objects = grow_objects(site, n_views, noise_m, config)
     left = unassigned_cells(site, objects, noise_m, config)
     if len(left) == 0:
         return objects
-    return add_low_objects(site, left, grazing_ray_count(site.points[left], *rays()), objects, noise_m, config)
+    is_passed = grazing_ray_count(site.points[left], *rays()) >= min_scans
+    return add_low_objects(site, left, is_passed, objects, noise_m, config)
 
 
 def _free_space_votes(

@@ -8,6 +8,8 @@ pixel. For it the single rays decide that returned from the floor just behind it
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
@@ -18,6 +20,7 @@ ROWS = 64
 COLUMNS = 512
 # Highest elevation of the image: covers a sensor with a vertical field of view of 90 degrees.
 _ELEVATION_RAD = np.deg2rad(45.6)
+PIXEL_WIDTH_RAD, PIXEL_HEIGHT_RAD = 2 * np.pi / COLUMNS, 2 * _ELEVATION_RAD / ROWS
 # A return farther behind a point than this passed it; a return within this distance may be from it.
 _MARGIN_M = 0.2
 _NEAREST_M = 0.5
@@ -64,19 +67,43 @@ def count_through_and_hit(points_odom: Float64Array, views: KeyframeViews) -> tu
     Arguments as of `free_space_votes`; keyframes farther than 15 m from a place are ignored.
     """
     n_through, n_hit = np.zeros((2, len(points_odom)), dtype=np.int64)
+    for _, in_view, is_through, is_hit in _look(points_odom, views, REACH_M):
+        n_through[in_view] += is_through
+        n_hit[in_view] += is_hit
+    return n_through, n_hit
+
+
+def through_and_hit_by_keyframe(
+    points_odom: Float64Array, views: KeyframeViews, reach_m: float = REACH_M
+) -> tuple[Int64Array, Int64Array]:
+    """Return how many of (N, 3) places each of the (K,) keyframes saw through, and how many it hit.
+
+    Args:
+        points_odom: (N, 3) places, odom frame of the observing session, metres.
+        views: Range images of its keyframes.
+        reach_m: Places farther from a keyframe are ignored; beyond 15 m a pixel is wider than small objects.
+    """
+    n_through, n_hit = np.zeros((2, len(views.ranges_m)), dtype=np.int64)
+    for keyframe, _, is_through, is_hit in _look(points_odom, views, reach_m):
+        n_through[keyframe], n_hit[keyframe] = np.count_nonzero(is_through), np.count_nonzero(is_hit)
+    return n_through, n_hit
+
+
+def _look(
+    points_odom: Float64Array, views: KeyframeViews, reach_m: float
+) -> Iterator[tuple[int, Int64Array, BoolArray, BoolArray]]:
+    """Yield each keyframe that can see some of (N, 3) places: the places in view, and whether it saw through or hit."""
     if len(points_odom) == 0 or len(views.ranges_m) == 0:
-        return n_through, n_hit
+        return
     centre = points_odom.mean(axis=0)
     spread_m = float(np.linalg.norm(points_odom - centre, axis=1).max())
     rotations, shifts = views.sensor_T_odom[:, :3, :3], views.sensor_T_odom[:, :3, 3]
     distances_m = np.linalg.norm(rotations @ centre + shifts, axis=1)
-    for keyframe in np.flatnonzero(distances_m <= REACH_M + spread_m):
+    for keyframe in np.flatnonzero(distances_m <= reach_m + spread_m).tolist():
         pixel, ranges_m = _pixels(points_odom @ rotations[keyframe].T + shifts[keyframe])
-        in_view = np.flatnonzero((pixel >= 0) & (ranges_m >= _NEAREST_M) & (ranges_m <= REACH_M))
+        in_view = np.flatnonzero((pixel >= 0) & (ranges_m >= _NEAREST_M) & (ranges_m <= reach_m))
         first_m, is_hit = _look_up(views.ranges_m[keyframe], pixel[in_view], ranges_m[in_view])
-        n_through[in_view] += np.isfinite(first_m) & (first_m > ranges_m[in_view] + _MARGIN_M)
-        n_hit[in_view] += is_hit
-    return n_through, n_hit
+        yield keyframe, in_view, np.isfinite(first_m) & (first_m > ranges_m[in_view] + _MARGIN_M), is_hit
 
 
 def grazing_ray_count(points: Float64Array, ends: Float64Array, origins: Float64Array, scans: Int64Array) -> Int64Array:
@@ -137,20 +164,30 @@ class _Cells:
 
 
 def _look_up(image: Float16Array, pixel: Int64Array, ranges_m: Float64Array) -> tuple[Float64Array, BoolArray]:
-    """Return the shortest range in each pixel's neighbourhood (inf without one), and whether any equals the point's."""
+    """Return the shortest range in each pixel's neighbourhood, and whether any equals the point's.
+
+    The neighbourhood is the pixel and the four around it. Few beams leave rows empty, and for the range the next row
+    counts. The range is infinite where nothing returned, and 0 where the pixel is empty and has no beam on one side, so
+    that what is there may lie between two.
+    """
     column, row_start = pixel % COLUMNS, pixel - pixel % COLUMNS
-    cross = (
-        pixel,
-        np.where(pixel >= COLUMNS, pixel - COLUMNS, pixel),
-        np.where(pixel < (ROWS - 1) * COLUMNS, pixel + COLUMNS, pixel),
-        row_start + (column + 1) % COLUMNS,
-        row_start + (column - 1) % COLUMNS,
-    )
-    seen_m = image.ravel().take(np.concatenate(cross)).astype(np.float64)
-    seen_m = seen_m.reshape(len(cross), -1)
+    flat = image.ravel()
+    rows = [flat.take(_move(pixel, step)) for step in (0, -1, 1)]
+    sides = [flat.take(row_start + (column + step) % COLUMNS) for step in (1, -1)]
+    seen_m = np.stack([*rows, *sides]).astype(np.float64)
     is_hit = np.asarray(np.any(np.abs(seen_m - ranges_m) <= _MARGIN_M, axis=0))
+    for row, step in ((1, -2), (2, 2)):
+        is_empty = np.flatnonzero(seen_m[row] == 0)
+        seen_m[row, is_empty] = flat.take(_move(pixel[is_empty], step))
+    is_between = (seen_m[0] == 0) & ((seen_m[1] == 0) | (seen_m[2] == 0))
     seen_m[seen_m == 0] = np.inf
-    return seen_m.min(axis=0), is_hit
+    return np.where(is_between, 0.0, seen_m.min(axis=0)), is_hit
+
+
+def _move(pixel: Int64Array, rows: int) -> Int64Array:
+    """Return the pixels that lie so many rows below; those at the edge of the image stay."""
+    moved = pixel + rows * COLUMNS
+    return np.where((moved >= 0) & (moved < ROWS * COLUMNS), moved, pixel)
 
 
 def _pixels(points_sensor: Float64Array) -> tuple[Int64Array, Float64Array]:

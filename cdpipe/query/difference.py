@@ -13,7 +13,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array
 from cdpipe.core.geometry.grid_index import GridIndex
 from cdpipe.extract.point_comparison import is_within
 from cdpipe.model.config import QueryConfig
-from cdpipe.model.types import DescriptorSet, MergedMaps
+from cdpipe.model.types import DescriptorSet, MergedMaps, SessionName
 from cdpipe.query.drift_width import LEAST_RADIUS_M
 
 # 1.5 voxels of a map with 0.2 m voxels; below it, gaps between points count as changes.
@@ -21,9 +21,13 @@ NEW_BEYOND_M = 0.3
 
 
 def sphere_difference(
-    merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig
+    merged: MergedMaps,
+    before: DescriptorSet,
+    after: DescriptorSet,
+    config: QueryConfig,
+    session: SessionName = "before",
 ) -> Float64Array:
-    """Score every before keyframe by the share of points around it that are over 0.3 m from the other map.
+    """Score every keyframe of a session by the share of points around it that are over 0.3 m from the other map.
 
     The share is over the points of both maps within `radius_m` of the keyframe and within `radius_m` of a keyframe of
     the other session. Beyond that the other session saw too little to compare. Where the radius of a region follows the
@@ -34,9 +38,10 @@ def sphere_difference(
         before: Gives the keyframe scans of the before session.
         after: Gives those of the after session.
         config: `radius_m` and `max_pair_m` are used.
+        session: The session of the K keyframes.
 
     Returns:
-        (Kb,) shares in [0, 1]; NaN for a keyframe without an after keyframe within `max_pair_m` or without points.
+        (K,) shares in [0, 1]; NaN for a keyframe without points or without one of the other within `max_pair_m`.
     """
     radius_m = LEAST_RADIUS_M if config.radius_m == "width" else config.radius_m
     before_path, after_path = merged.keyframe_positions(before, after)
@@ -49,8 +54,9 @@ def sphere_difference(
         (seen_before, ~is_within(seen_before, after_points, NEW_BEYOND_M)),
         (seen_after, ~is_within(seen_after, merged.before.points, NEW_BEYOND_M)),
     ]
-    scores = marked_share(clouds, before_path, radius_m)
-    scores[~is_within(before_path, after_path, config.max_pair_m)] = np.nan
+    path, other_path = (before_path, after_path) if session == "before" else (after_path, before_path)
+    scores = marked_share(clouds, path, radius_m)
+    scores[~is_within(path, other_path, config.max_pair_m)] = np.nan
     return scores
 
 

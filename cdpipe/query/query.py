@@ -18,12 +18,15 @@ from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.descriptors.sphere import change_log_odds
 from cdpipe.model.config import PipelineConfig, QueryConfig
 from cdpipe.model.report import ChangeRegions
-from cdpipe.model.types import DescriptorSet, MergedMaps, UInt8Array
+from cdpipe.model.types import DescriptorSet, MergedMaps, SessionName, UInt8Array
 from cdpipe.query.difference import sphere_difference
 from cdpipe.query.drift_width import keyframe_radii, score_radii
 
 # Values of `ChangeRegions.direction`: the session whose keyframe is queried in the other session.
 BEFORE, AFTER = 0, 1
+# Keyframes of a tripod survey lie so far apart, and what lies between them is in no sphere.
+_GAP_M = 3.0
+_GAP_SHARE = 0.75  # of their distance, within which a keyframe of the robot is near one of them
 # Keyframe scores, in log-odds: what is surer than this (0.95) counts as this, so that a sure change some metres away is
 # not above a doubtful one here; and the fall per metre, which ranks keyframes near one change by their distance. Mean
 # AUROC and AP of 16 validation pairs (3 narrow, 7 caves, 6 wide): 0.999 and 0.994; without both 0.992 and 0.90.
@@ -46,43 +49,54 @@ def find_regions(
     """
     query = config.query
     places = _Places(merged, before, after, query)
-    radii_b = keyframe_radii(merged.before, before.keyframe_scans, query)
+    session = places.asked
+    described = before if session == "before" else after
+    radii_m = keyframe_radii(merged.map_of(session), described.keyframe_scans, query)
     match config.regions.source:
         case "scan":
-            radii_a = keyframe_radii(merged.after, after.keyframe_scans, query)
-            return _score_by_scans(places, before, after, query, radii_b, radii_a)
+            return _score_by_scans(merged, places, before, after, query)
         case "sphere":
             # a sphere descriptor covers 2 m of tunnel before and behind its keyframe
-            scores = change_log_odds(merged, before, places.is_covered_b, config.sphere)
+            scores = change_log_odds(merged, described, places.is_covered(session), config.sphere, session)
             keyframe_scores = _score_surroundings(
                 places,
+                session,
                 score_radii(merged.before, before.keyframe_scans, query),
                 lambda near, away_m: np.minimum(scores[near], _SURE) - _FALL_PER_M * away_m,
             )
         case "sphere-difference":
-            scores = sphere_difference(merged, before, after, query)
-            keyframe_scores = score_keyframes_by_share(scores, merged, before, after, query)
+            near = query.model_copy(update={"max_pair_m": places.max_pair_m})
+            scores = sphere_difference(merged, before, after, near, session)
+            keyframe_scores = score_keyframes_by_share(scores, merged, before, after, query, session)
         case "every-keyframe":
-            scores = keyframe_scores = np.where(places.is_covered_b, 0.0, np.nan)
+            scores = np.where(places.is_covered(session), 0.0, np.nan)
+            keyframe_scores = np.where(places.is_covered("before"), 0.0, np.nan)
         case other:
             raise ValueError(f"{other} is no source of regions at keyframes")
+    direction = _from(BEFORE if session == "before" else AFTER, scores)
     return rank_regions(
-        places.before, scores, places.pairs_b, keyframe_scores, query, _from(BEFORE, scores), radii_m=radii_b
+        places.of(session), scores, places.pairs(session), keyframe_scores, query, direction, radii_m=radii_m
     )
 
 
 def score_keyframes_by_share(
-    shares: Float64Array, merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig
+    shares: Float64Array,
+    merged: MergedMaps,
+    before: DescriptorSet,
+    after: DescriptorSet,
+    config: QueryConfig,
+    session: SessionName = "before",
 ) -> Float64Array:
-    """Return the (K,) scores of the before keyframes from the (K,) shares of new points around them.
+    """Return the (Kb,) scores of the before keyframes from the (K,) shares of new points around those of a session.
 
     A share counts where it was measured; where the radius follows the width of the drift, also for the keyframes
     around, less 3 % per metre.
     """
-    if config.radius_m != "width":
+    if config.radius_m != "width" and session == "before":
         return shares
     return _score_surroundings(
         _Places(merged, before, after, config),
+        session,
         score_radii(merged.before, before.keyframe_scans, config),
         lambda near, away_m: shares[near] * (1.0 - _SHARE_FALL_PER_M * away_m),
     )
@@ -93,23 +107,38 @@ class _Places:
 
     def __init__(self, merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> None:
         self.before, self.after = merged.keyframe_positions(before, after)
+        # it is asked at the keyframes of the before session what changed, unless they leave gaps
+        step_b, step_a = (_usual_step_m(each) for each in (self.before, self.after))
+        has_gaps = step_b > max(_GAP_M, step_a)
+        self.asked: SessionName = "after" if has_gaps else "before"
+        # then what lies between two of them counts as theirs
+        self.max_pair_m = max(config.max_pair_m, _GAP_SHARE * step_b) if has_gaps else config.max_pair_m
         gap_b, self.near_a = query_nearest(self.before, self.after)
         gap_a, self.near_b = query_nearest(self.after, self.before)
-        self.is_covered_b, self.is_covered_a = gap_b <= config.max_pair_m, gap_a <= config.max_pair_m
+        self.is_covered_b, self.is_covered_a = gap_b <= self.max_pair_m, gap_a <= self.max_pair_m
 
-    @property
-    def pairs_b(self) -> Int64Array:
-        """(Kb, 2) index of each before keyframe and of its nearest after keyframe."""
-        return np.column_stack([np.arange(len(self.near_a)), self.near_a])
+    def of(self, session: SessionName) -> Float64Array:
+        """(K, 3) positions of the keyframes of a session."""
+        return self.before if session == "before" else self.after
+
+    def is_covered(self, session: SessionName) -> BoolArray:
+        """(K,) whether the other session came near each keyframe of a session."""
+        return self.is_covered_b if session == "before" else self.is_covered_a
+
+    def pairs(self, session: SessionName) -> Int64Array:
+        """(K, 2) before and after keyframe: each of a session and the nearest of the other."""
+        if session == "before":
+            return np.column_stack([np.arange(len(self.near_a)), self.near_a])
+        return np.column_stack([self.near_b, np.arange(len(self.near_b))])
+
+
+def _usual_step_m(positions: Float64Array) -> float:
+    """Return the median distance from each of (K, 3) positions to the next; 0 of a single one."""
+    return float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1))) if len(positions) > 1 else 0.0
 
 
 def _score_by_scans(
-    places: _Places,
-    before: DescriptorSet,
-    after: DescriptorSet,
-    config: QueryConfig,
-    radii_b: Float64Array,
-    radii_a: Float64Array,
+    merged: MergedMaps, places: _Places, before: DescriptorSet, after: DescriptorSet, config: QueryConfig
 ) -> ChangeRegions:
     """Score every keyframe of both sessions by the descriptor distance to its partner.
 
@@ -140,27 +169,36 @@ def _score_by_scans(
         keyframe_scores=keyframe_scores,
         config=config,
         direction=np.concatenate([_from(AFTER, pairs_a[is_candidate_a]), _from(BEFORE, pairs_b[is_candidate_b])]),
-        radii_m=np.concatenate([radii_a[is_candidate_a], radii_b[is_candidate_b]]),
+        radii_m=np.concatenate(
+            [
+                keyframe_radii(merged.after, after.keyframe_scans, config)[is_candidate_a],
+                keyframe_radii(merged.before, before.keyframe_scans, config)[is_candidate_b],
+            ]
+        ),
     )
 
 
 def _score_surroundings(
-    places: _Places, score_m: Float64Array, score_from: Callable[[Int64Array, Float64Array], Float64Array]
+    places: _Places,
+    session: SessionName,
+    score_m: Float64Array,
+    score_from: Callable[[Int64Array, Float64Array], Float64Array],
 ) -> Float64Array:
     """Return the (K,) score of every before keyframe: the largest of those that its surroundings have from there.
 
     Args:
         places: Positions of the keyframes.
+        session: The session that was asked.
         score_m: (K,) radius of the surroundings.
-        score_from: Returns the (N,) scores of (N,) keyframes as seen from (N,) metres away.
+        score_from: Returns the (N,) scores of (N,) keyframes of that session as seen from (N,) metres away.
     """
     keyframe_scores = np.full(len(places.before), np.nan)
-    covered = np.flatnonzero(places.is_covered_b)
-    tree = cKDTree(places.before[covered])
-    for keyframe in covered:
-        near = covered[tree.query_ball_point(places.before[keyframe], score_m[keyframe])]
-        away_m = np.linalg.norm(places.before[near] - places.before[keyframe], axis=1)
-        keyframe_scores[keyframe] = np.fmax.reduce(score_from(near, away_m))
+    positions, asked = places.of(session), np.flatnonzero(places.is_covered(session))
+    tree = cKDTree(positions[asked])
+    for keyframe in np.flatnonzero(places.is_covered_b):
+        near = asked[tree.query_ball_point(places.before[keyframe], score_m[keyframe])]
+        away_m = np.linalg.norm(positions[near] - places.before[keyframe], axis=1)
+        keyframe_scores[keyframe] = np.fmax.reduce(score_from(near, away_m), initial=np.nan)
     return keyframe_scores
 
 

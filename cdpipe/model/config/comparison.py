@@ -64,7 +64,7 @@ class QueryConfig(Settings):
 class ExtractConfig(GrownSettings):
     """Object extraction: the paper's point-to-voxel comparison, distances, surfaces, or what the source cut out."""
 
-    newer: ClassVar[frozenset[str]] = frozenset({"recentre"})
+    newer: ClassVar[frozenset[str]] = frozenset({"recentre", "movers"})
 
     method: Literal["surface", "voxel", "nearest", "clusters"] = Field(
         "surface",
@@ -88,7 +88,14 @@ class ExtractConfig(GrownSettings):
         30, description="`surface`: fewest cells of 0.05 m that are `seed_m` from the surface and were seen through"
     )
     min_views: Positive = Field(
-        2.5, description="`surface`: least mean number of keyframes that saw through a cell, minus those that hit it"
+        2.5,
+        description=(
+            "`surface`: least mean number of keyframes that saw through a cell, minus those that hit it; one that lies "
+            "over 3 m from the next counts as up to three"
+        ),
+    )
+    movers: Literal["keep", "drop"] = Field(
+        "drop", description="`surface`: objects that are people, or came and left while their session was recorded"
     )
 
 

@@ -128,6 +128,11 @@ def test_a_new_block_is_found_where_it_stands_whatever_the_after_session_s_frame
         assert logits[far].max() < logits.max() - 2
         first = logits if first is None else first
         np.testing.assert_allclose(logits, first, atol=0.2)  # points on a pixel's border may change sides
+        # asked at the keyframes of the other session, it is the same with the sessions swapped
+        swapped = MergedMaps(merged.after, merged.before, invert(before_T_after), {}, True)
+        asked = change_logits(merged, _set_of(merged.after), covered, session="after")
+        np.testing.assert_allclose(asked, change_logits(swapped, _set_of(merged.after), covered), atol=1e-4)
+        assert abs(asked.max(axis=1).argmax() - 12) <= 1
 
 
 def test_eight_bits_say_about_the_same() -> None:

@@ -294,16 +294,16 @@ def test_a_low_object_is_what_scans_passed_and_most_of_it_clear() -> None:
     assert sorted(left.tolist()) == np.flatnonzero(site.points[:, 2] > 0.04).tolist()
     height_m = site.points[left, 2]
     # passed above 0.12 m all is clear, and the rest is its foot
-    (found,) = add_low_objects(site, left, np.where(height_m > 0.12, 3, 2), [], 0.0, CONFIG)
+    (found,) = add_low_objects(site, left, height_m > 0.12, [], 0.0, CONFIG)
     assert sorted(found.tolist()) == sorted(left.tolist())
-    assert add_low_objects(site, left, np.full(len(left), 2), [], 0.0, CONFIG) == []
+    assert add_low_objects(site, left, np.zeros(len(left), np.bool_), [], 0.0, CONFIG) == []
     # two thirds of what was passed are clear, or half with a noise of 1.5 cm, which asks for 12 cm
-    assert len(add_low_objects(site, left, np.full(len(left), 3), [], 0.0, CONFIG)) == 1
+    assert len(add_low_objects(site, left, np.ones(len(left), np.bool_), [], 0.0, CONFIG)) == 1
     noisy = unassigned_cells(site, [], 0.015, CONFIG)
     assert sorted(noisy.tolist()) == np.flatnonzero(site.points[:, 2] > 0.09).tolist()
-    assert len(add_low_objects(site, noisy, np.full(len(noisy), 3), [], 0.015, CONFIG)) == 1
+    assert len(add_low_objects(site, noisy, np.ones(len(noisy), np.bool_), [], 0.015, CONFIG)) == 1
     # a third is clear: so it is with a surface that is a little off
-    assert add_low_objects(site, left, np.full(len(left), 3), [], 0.015, CONFIG) == []
+    assert add_low_objects(site, left, np.ones(len(left), np.bool_), [], 0.015, CONFIG) == []
     # noise raises what counts as clear
     assert len(unassigned_cells(site, [], 0.02, CONFIG)) == 0
 
@@ -311,7 +311,7 @@ def test_a_low_object_is_what_scans_passed_and_most_of_it_clear() -> None:
 def test_a_thin_thing_is_an_object_on_the_floor_alone() -> None:
     thin = lattice((0, 0, 0.1), (1.15, 0.95, 0.1), 0.05)
     site = on_floor(thin)
-    passed = np.full(len(thin), 3)
+    passed = np.ones(len(thin), np.bool_)
     left = unassigned_cells(site, [], 0.0, CONFIG)
     assert sorted(left.tolist()) == list(range(len(thin)))
     assert len(add_low_objects(site, left, passed, [], 0.0, CONFIG)) == 1
@@ -338,10 +338,10 @@ def test_what_touches_an_object_is_a_part_of_it_and_no_low_one() -> None:
         assert len(taken) == 1
         left = unassigned_cells(site, taken, 0.0, CONFIG)
         assert not set(left.tolist()) & set(taken[0].tolist())
-        n_past = np.where(site.points[left, 2] > 0.12, 3, 0)
-        found = add_low_objects(site, left, n_past, taken, 0.0, CONFIG)
+        is_passed = site.points[left, 2] > 0.12
+        found = add_low_objects(site, left, is_passed, taken, 0.0, CONFIG)
         assert len(found) == 1 + n_new
-        passed = set(left[n_past == 3].tolist())
+        passed = set(left[is_passed].tolist())
         assert passed <= set(found[-1].tolist())
         assert set(taken[0].tolist()) <= set(found[0].tolist())
 

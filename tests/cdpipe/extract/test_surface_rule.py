@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -14,41 +12,14 @@ from cdpipe.extract.objects import PointGroup, ReturnPool
 from cdpipe.extract.surface_rule import cut_by_surface, realign
 from cdpipe.merge.registration import Surface
 from cdpipe.model.config import ExtractConfig
-from cdpipe.model.types import MergedMaps, PointMap, PosedScan
+from cdpipe.model.types import MergedMaps, PointMap
+from tests.cdpipe.cut_rooms import CONFIG, CRATE, MIDDLE, Scanned, cut, iou, returns_of, scanned
 from tests.cdpipe.rooms import PATH, Box, RoomScans, room_regions
 
-CONFIG = ExtractConfig()
-CRATE: Box = ((1.0, 1.5, 0.0), (2.0, 2.3, 0.8))
 BARREL: Box = ((-2.2, -2.6, 0.0), (-1.6, -1.9, 0.6))
 BEAM: Box = ((-1.2, 2.0, 0.0), (1.2, 2.5, 0.5))  # longer than what lies between two regions
-MIDDLE = (0.0, 0.0, 1.0)
 # What lies this near to floor or wall is no farther off than noise and cells of 0.05 m.
 FOOT_M = 0.06
-
-Scanned = tuple[RoomScans, PointMap]
-
-
-@cache
-def scanned(boxes: tuple[Box, ...], sample: int, path: tuple[tuple[float, float, float], ...] = PATH) -> Scanned:
-    scans = RoomScans(boxes, sample, path)
-    return scans, scans.mapped()
-
-
-def cut(
-    before: Scanned, after: Scanned, centres: Sequence[tuple[float, float, float]] = (MIDDLE,), radius_m: float = 4.5
-) -> list[PointGroup]:
-    pair = MergedMaps(before[1], after[1], np.eye(4), {}, True)
-    return cut_by_surface(pair, room_regions(centres, radius_m), CONFIG)
-
-
-def returns_of(point_map: PointMap, group: PointGroup) -> set[tuple[int, int]]:
-    assert group.returns is not None
-    scans = np.searchsorted(point_map.scan_offsets, group.returns, side="right") - 1
-    return set(zip(scans.tolist(), point_map.return_pixels[group.returns].tolist(), strict=True))
-
-
-def iou(one: set[tuple[int, int]], other: set[tuple[int, int]]) -> float:
-    return len(one & other) / len(one | other)
 
 
 def assert_is_cut_out(group: PointGroup, session: Scanned, box: int, lowest_m: float = FOOT_M) -> None:
@@ -103,157 +74,23 @@ def test_a_pallet_is_found_by_the_rays_that_passed_it(monkeypatch: pytest.Monkey
     assert cut(before, after) == []
 
 
-def test_nothing_changed() -> None:
-    assert cut(scanned((), 1), scanned((), 3)) == []
-    assert cut(scanned((CRATE, BARREL), 1), scanned((CRATE, BARREL), 2)) == []
-
-
-def drifted(boxes: tuple[Box, ...], path: Sequence[tuple[float, float, float]], off_m: float) -> Scanned:
-    """A session that came by again, the second time with an odometry that is off sideways."""
-    scans = RoomScans(boxes, 2, (*PATH, *path))
-    scans.odom_T_sensor[len(PATH) :, 1, 3] += off_m
-    return scans, scans.mapped()
-
-
-def both_ways(session: str, one: Scanned, other: Scanned) -> list[PointGroup]:
-    return cut(one, other) if session == "before" else cut(other, one)
-
-
-@pytest.mark.parametrize("session", ["before", "after"])
-def test_a_wall_that_hangs_in_the_room_after_drift_is_no_change(session: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    twice = drifted((CRATE,), ((0.0, 0.0, 1.5),), -0.5)
-    (crate,) = both_ways(session, twice, scanned((), 1))
-    of_first_pass = {each for each in twice[0].returns_on(0) if each[0] < len(PATH)}
-    assert len(returns_of(twice[1], crate) & of_first_pass) > 0.9 * len(of_first_pass)
-    monkeypatch.setattr(cdpipe.extract.surface_rule, "_is_out_of_place", lambda *_: False)
-    assert len(both_ways(session, twice, scanned((), 1))) > 1
-
-
-HALL: Box = ((-5.0, -4.0, 0.0), (40.0, 4.0, 3.0))
-LOCKER: Box = ((1.0, 1.5, 0.0), (2.6, 3.1, 2.0))
-DOWN_THE_HALL = tuple((x, 0.0, 1.5) for x in np.arange(18.0, 36.0, 1.0).tolist())
-
-
-def in_the_hall(path: Sequence[tuple[float, float, float]], n_off: int = 0, off_m: float = 0.0) -> Scanned:
-    """A session in a long hall with a locker; of its first scans the odometry is off sideways."""
-    scans = RoomScans((LOCKER,), 2, path, room=HALL)
-    scans.odom_T_sensor[:n_off, 1, 3] += off_m
-    return scans, scans.mapped()
-
-
-@pytest.mark.parametrize("session", ["before", "after"])
-def test_what_only_scans_from_afar_show_is_no_change_where_the_session_came_near(
-    session: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cdpipe.extract.surface_rule, "_DOUBLED", np.inf)  # as from near
-    monkeypatch.setattr(cdpipe.extract.surface_rule, "_ON_ITS_WAY", np.inf)
-    right = in_the_hall((*DOWN_THE_HALL, *PATH))
-    off = in_the_hall((*DOWN_THE_HALL, *PATH), len(DOWN_THE_HALL), -1.2)
-    assert both_ways(session, off, right) == []
-    monkeypatch.setattr(cdpipe.extract.surface_rule, "_DOUBLED_AFAR", np.inf)
-    hanging = both_ways(session, off, right)[0]  # the locker again, in front of itself
-    assert hanging.points_map[:, 1].max() < 1.5
-
-
-@pytest.mark.parametrize(
-    "path",
-    [
-        tuple((x, 0.0, 1.5) for x in np.arange(13.8, 36.0, 0.7).tolist()),  # it came no nearer than 12 m
-        # it waited before it came
-        (*((18.0, 0.0, 1.5),) * 100, *((x, 0.0, 1.5) for x in np.arange(18.0, 8.0, -0.7).tolist())),
-        ((8.0, 0.0, 1.5), *DOWN_THE_HALL),  # one scan from near shows it too
-    ],
-)
-def test_a_thing_seen_mostly_from_afar_is_a_change_all_the_same(path: Sequence[tuple[float, float, float]]) -> None:
-    empty = RoomScans((), 1, (*DOWN_THE_HALL, *PATH), room=HALL)
-    after = in_the_hall(path)
-    found = set().union(*(returns_of(after[1], group) for group in cut((empty, empty.mapped()), after)))
-    assert iou(found, after[0].returns_on(0)) > 0.7
-    ranges_m = [np.linalg.norm(after[0].scan(scan).points_sensor[pixel]) for scan, pixel in found]
-    assert np.mean(np.array(ranges_m) > 15.0) > 0.5
-
-
-class Passing(RoomScans):
-    """A room in which a crate stands while some scans are taken, and is gone in the others."""
-
-    def __init__(self, scans: Sequence[int], path: Sequence[tuple[float, float, float]]) -> None:
-        super().__init__((), 2, path)
-        self._with, self._scans = RoomScans((CRATE,), 2, path), scans
-
-    def scan(self, index: int) -> PosedScan:
-        return self._with.scan(index) if index in self._scans else super().scan(index)
-
-
-ALONG = tuple((x, 0.0, 1.5) for x in np.arange(-2.0, 2.5, 0.5).tolist())
-
-
-@pytest.mark.parametrize("session", ["before", "after"])
-def test_a_crate_that_a_third_of_the_scans_saw_through_is_no_change(session: str) -> None:
-    for seen, is_change in ((range(9), True), (range(8), True), (range(4), False), ((4,), False)):
-        passing = Passing(seen, ALONG)
-        assert bool(both_ways(session, (passing, passing.mapped()), scanned((), 1))) == is_change, seen
-
-
-@pytest.mark.parametrize(
-    ("seen", "n_scans", "apart_m", "is_fleeting"),
-    [
-        ([5], 20, 0.5, True), ([5, 6, 6], 20, 0.5, True), ([5, 6, 7], 20, 0.5, False), ([5, 7], 20, 0.5, True),
-        ([0], 20, 0.5, True), ([19], 20, 0.5, True), ([5], 20, 10.0, False), ([0, 1], 2, 0.5, False),
-        ([0], 1, 0.5, False), ([2], 20, 0.0, True), ([5, 15], 20, 0.5, False),
-    ],
-)  # fmt: skip
-def test_one_or_two_scans_between_near_ones_are_fleeting(
-    seen: list[int], n_scans: int, apart_m: float, is_fleeting: bool
-) -> None:
-    poses = np.tile(np.eye(4), (n_scans, 1, 1))
-    poses[:, 0, 3] = apart_m * np.arange(n_scans)
-    assert cdpipe.extract.surface_rule._is_fleeting(poses, np.array(seen)) == is_fleeting
-
-
-@pytest.mark.parametrize("n_again", [3, 5, 7])
-def test_a_thing_that_stands_twice_after_drift_is_still_a_change(n_again: int) -> None:
-    tall: Box = ((-0.3, -0.3, 0.0), (0.3, 0.3, 1.6))
-    beside = tuple((x, 2.0, 1.5) for x, _, _ in PATH)
-    before = scanned((), 1)
-    path = tuple((x, -2.0, 1.5) for x, _, _ in PATH)
-    scans = RoomScans((tall,), 2, (*path, *beside[:n_again]))
-    scans.odom_T_sensor[len(path) :, 1, 3] -= 1.2
-    twice = scans, scans.mapped()
-    found = set().union(*(returns_of(twice[1], group) for group in cut(before, twice)))
-    first = {each for each in scans.returns_on(0) if each[0] < len(path)}
-    for of_pass in (first, scans.returns_on(0) - first):
-        assert len(found & of_pass) > 0.7 * len(of_pass)
-
-
-@pytest.mark.parametrize(("n_again", "is_found"), [(1, False), (3, True), (7, True)])
-def test_what_was_put_down_between_two_passes_is_a_change_if_the_second_was_no_glimpse(
-    n_again: int, is_found: bool
-) -> None:
-    without, with_crate = RoomScans((), 4), RoomScans((CRATE,), 5)
-
-    class Both(RoomScans):
-        def __init__(self) -> None:
-            self.name = "put down in between"
-            self.odom_T_sensor = np.concatenate([without.odom_T_sensor, with_crate.odom_T_sensor[:n_again]])
-
-        def scan(self, index: int) -> PosedScan:
-            if index < len(PATH):
-                return without.scan(index)
-            return replace(with_crate.scan(index - len(PATH)), index=index)
-
-        def scans(self) -> Iterator[PosedScan]:
-            return (self.scan(index) for index in range(len(self.odom_T_sensor)))
-
-    scans = Both()
-    found = cut(scanned((), 1), (scans, scans.mapped()))
+@pytest.mark.parametrize(("apart_m", "is_found"), [(1.0, False), (10.0, True)])
+@pytest.mark.parametrize("height_m", [0.144, 0.8])
+def test_one_of_the_stations_of_a_survey_is_enough(apart_m: float, is_found: bool, height_m: float) -> None:
+    hall: Box = ((-5.0, -4.0, 0.0), (20.0, 4.0, 3.0))
+    box: Box = ((-0.6, 1.6, 0.0), (0.6, 2.6, height_m))
+    screen: Box = ((1.5, -3.0, 0.0), (1.6, 4.0, 3.0))  # hides it from all but the first
+    stations = tuple((-2.0 + apart_m * k, -2.0, 1.5) for k in range(3) if k == 0 or apart_m * k > 4.0)
+    far = tuple((4.0 + apart_m * k, -2.0, 1.5) for k in range(3))
+    survey = RoomScans((screen,), 1, stations if apart_m > 4.0 else (stations[0], *far), room=hall)
+    robot = RoomScans((screen, box), 2, tuple((x, -1.0, 1.5) for x in np.arange(-4.0, 1.0, 0.5).tolist()), room=hall)
+    found = cut((survey, survey.mapped()), (robot, robot.mapped()))
     assert bool(found) == is_found
 
 
-def test_maps_without_views_keep_what_they_cannot_judge() -> None:
-    twice = drifted((CRATE,), ((0.0, 0.0, 1.5),), -0.5)
-    with_views = both_ways("after", twice, scanned((), 1))
-    blind = both_ways("after", (twice[0], replace(twice[1], views=None)), scanned((), 1))
-    assert len(blind) > len(with_views) == 1
+def test_nothing_changed() -> None:
+    assert cut(scanned((), 1), scanned((), 3)) == []
+    assert cut(scanned((CRATE, BARREL), 1), scanned((CRATE, BARREL), 2)) == []
 
 
 def test_two_objects_in_one_region_are_two() -> None:

@@ -15,7 +15,7 @@ from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
 from cdpipe.mapping import airborne
 from cdpipe.mapping.airborne import ClearScans, LiesOnSurface, clear_air, drop_airborne
-from cdpipe.mapping.free_space import free_space_votes, render_view
+from cdpipe.mapping.free_space import PIXEL_HEIGHT_RAD, free_space_votes, render_view
 from cdpipe.mapping.mapping import build_map
 from cdpipe.model.config import MapConfig, load_config
 from cdpipe.model.types import KeyframeViews, PosedScan, WrappedScans
@@ -92,11 +92,15 @@ def test_a_place_from_which_returns_were_dropped_was_not_seen_through() -> None:
     scan = drop_airborne(scan_of(ranges_m, signal))
     assert len(scan.points_sensor) == WIDTH - 20 and scan.airborne_sensor is not None
     patch = scan.airborne_sensor
-    images = [render_view(scan.points_sensor, airborne) for airborne in (None, patch)]
+    # beams above and below meet the wall alone
+    level = scan_of(np.full(WIDTH, 7.0), signal).points_sensor
+    beside = [level + np.array([0.0, 0.0, 7.0 * rows * PIXEL_HEIGHT_RAD]) for rows in (0.5, -1.5)]
+    images = [render_view(np.concatenate([scan.points_sensor, *beside]), airborne) for airborne in (None, patch)]
     votes = [free_space_votes(patch, KeyframeViews(image[None], np.eye(4)[None])) for image in images]
     assert votes[0].max() == 1 and votes[1].max() == 0
     # a kept return of the same pixel decides: here the mist in front of it was dropped
-    assert np.array_equal(render_view(scan.points_sensor, 0.5 * scan.points_sensor), images[0])
+    plain = render_view(scan.points_sensor)
+    assert np.array_equal(render_view(scan.points_sensor, 0.5 * scan.points_sensor), plain)
 
 
 def test_only_a_dusty_scan_loses_returns() -> None:

@@ -128,11 +128,17 @@ def test_looking_up_equals_its_slow_twin(seed: int) -> None:
             row, column = pixel_of(in_sensor)
             if not (0 <= row < ROWS and 0.5 <= range_m <= 15.0):
                 continue
-            cross = [(row, column), (row, (column + 1) % COLUMNS), (row, (column - 1) % COLUMNS)]
-            cross += [(max(row - 1, 0), column), (min(row + 1, ROWS - 1), column)]
-            seen = [float(image[pixel]) for pixel in cross if image[pixel] > 0]
-            balance += bool(seen) and min(seen) > range_m + 0.2
-            balance -= any(abs(each - range_m) <= 0.2 for each in seen)
+            level = [float(image[row, (column + step) % COLUMNS]) for step in (0, 1, -1)]
+            up, down = (
+                [float(image[row + step * far, column]) if 0 <= row + step * far < ROWS else level[0] for far in (1, 2)]
+                for step in (-1, 1)
+            )
+            # the next row with a beam, or the one after it
+            above, below = (near or far for near, far in (up, down))
+            seen = [each for each in (*level, above, below) if each > 0]
+            is_between = level[0] == 0 and (above == 0 or below == 0)
+            balance += bool(seen) and not is_between and min(seen) > range_m + 0.2
+            balance -= any(each > 0 and abs(each - range_m) <= 0.2 for each in (*level, up[0], down[0]))
         expected.append(balance)
     found = free_space_votes(points, KeyframeViews(images, invert(poses)))
     assert 0.1 < np.mean(np.array(expected) > 0) < 0.9

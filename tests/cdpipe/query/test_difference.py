@@ -120,6 +120,20 @@ def test_moving_the_after_session_changes_nothing() -> None:
     assert 0 < still[0] < 1
 
 
+def test_the_keyframes_of_the_after_session_are_those_of_the_before_session_of_swapped_maps() -> None:
+    rng = np.random.default_rng(6)
+    before = rng.uniform(-6, 6, (200, 3))
+    after = np.where(rng.random((200, 1)) < 0.5, before, rng.uniform(-6, 6, (200, 3)))
+    maps = point_map(before, line(0, 2), np.eye(4)), point_map(after, line(-1, 1, 9), np.eye(4))
+    sets = [
+        DescriptorSet(np.zeros((len(m.keyframe_scans), 2), np.float32), None, m.keyframe_scans, "-", "") for m in maps
+    ]
+    swapped = sphere_difference(MergedMaps(*maps[::-1], np.eye(4), {}, True), *sets[::-1], QueryConfig())
+    found = sphere_difference(MergedMaps(*maps, np.eye(4), {}, True), *sets, QueryConfig(), "after")
+    np.testing.assert_array_equal(found, swapped)
+    assert len(found) == 3 and np.isnan(found).tolist() == [False, False, True]
+
+
 def test_the_border_is_within() -> None:
     assert is_within(line(1.0, 1.5, 1.6), line(0.5), 1.0).tolist() == [True, True, False]
     assert is_within(line(1.0), line(), 1.0).tolist() == [False]

@@ -221,3 +221,42 @@ def test_scores_of_the_sphere_difference_by_hand(monkeypatch: pytest.MonkeyPatch
     np.testing.assert_allclose(follows.keyframe_scores, [0.5 * 0.94, 0.5, 0.5 * 0.94, 0.2])
     fixed = find_regions(merged, before[1], before[1], by("sphere-difference", radius_m=4.5))
     np.testing.assert_array_equal(fixed.keyframe_scores, [0.1, 0.5, np.nan, 0.2])
+
+
+# Three stations of a tripod, and a robot that goes on for 10 m beyond the last.
+STATIONS = session([(x, 0, 0) for x in (0.0, 10.0, 20.0)], [[1, 0]] * 3)
+DRIVE = session([(x, 1, 0) for x in np.arange(0.0, 31.0).tolist()], [[1, 0]] * 31)
+
+
+def test_between_the_stations_of_a_survey_it_is_asked_at_the_keyframes_of_the_robot() -> None:
+    merged = MergedMaps(STATIONS[0], DRIVE[0], make_pose(), {}, True)
+    found = find_regions(merged, STATIONS[1], DRIVE[1], by("every-keyframe", suppression=1e-9))
+    # those within 7.5 m of a station
+    assert sorted(found.centres_map[:, 0].tolist()) == list(range(28))
+    assert found.direction is not None and (found.direction == 1).all()
+    pairs = dict(zip(found.pairs[:, 1].tolist(), found.pairs[:, 0].tolist(), strict=True))
+    assert [pairs[k] for k in (0, 4, 6, 14, 16, 25)] == [0, 0, 1, 1, 2, 2]
+    assert found.keyframe_scores.tolist() == [0.0, 0.0, 0.0]
+    # the other way round the stations are the after session, and two drives have no gaps
+    for before, after in ((DRIVE, STATIONS), (DRIVE, DRIVE)):
+        merged = MergedMaps(before[0], after[0], make_pose(), {}, True)
+        found = find_regions(merged, before[1], after[1], by("every-keyframe", suppression=1e-9))
+        assert found.direction is not None and (found.direction == 0).all()
+
+
+@pytest.mark.parametrize("source", ["sphere", "sphere-difference"])
+def test_stations_have_the_best_score_around_them(source: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    local = np.full(31, 0.1)
+    local[[3, 7]] = 0.5, 0.4
+    name = {"sphere": "change_log_odds", "sphere-difference": "sphere_difference"}[source]
+    sessions = []
+    monkeypatch.setattr(f"cdpipe.query.query.{name}", lambda *given: sessions.append(given[-1]) or local)
+    merged = MergedMaps(STATIONS[0], DRIVE[0], make_pose(), {}, True)
+    found = find_regions(merged, STATIONS[1], DRIVE[1], by(source, radius_m=4.5))
+    assert sessions == ["after"]
+    assert found.centres_map[0].tolist() == [3.0, 1.0, 0.0] and found.scores[0] == 0.5
+    away_m = np.sqrt(10.0)
+    first, second = (0.5 - 0.1 * away_m, 0.4 - 0.1 * away_m) if source == "sphere" else (
+        0.5 * (1 - 0.03 * away_m), 0.4 * (1 - 0.03 * away_m)
+    )  # fmt: skip
+    np.testing.assert_allclose(found.keyframe_scores[:2], [first, second])

@@ -109,4 +109,6 @@ def test_mine_has_ten_pairs_of_every_family_with_an_effect_beside_their_clean_tw
         *(f"{effect}wide" for effect in ("", "dynamic/", "dust/", "glare/")),
         "dust/haul",
     }
-    assert {"tunnelcd[map.movers=keep]", "tunnelcd[map.airborne=keep]"} < {cell.variant for cell in found}
+    assert {"tunnelcd[map.movers=keep,extract.movers=keep]", "tunnelcd[map.airborne=keep]"} < {
+        cell.variant for cell in found
+    }

@@ -1,0 +1,214 @@
+"""What its own session tells to be no object that stands: doubles of walls, people, machines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import cdpipe.extract.presence
+from cdpipe.extract.objects import PointGroup
+from cdpipe.extract.presence import is_fleeting
+from cdpipe.model.config import ExtractConfig
+from cdpipe.model.types import PosedScan
+from tests.cdpipe.cut_rooms import CONFIG, CRATE, Scanned, cut, iou, returns_of, scanned
+from tests.cdpipe.rooms import PATH, Box, RoomScans
+
+
+def drifted(boxes: tuple[Box, ...], path: Sequence[tuple[float, float, float]], off_m: float) -> Scanned:
+    """A session that came by again, the second time with an odometry that is off sideways."""
+    scans = RoomScans(boxes, 2, (*PATH, *path))
+    scans.odom_T_sensor[len(PATH) :, 1, 3] += off_m
+    return scans, scans.mapped()
+
+
+def both_ways(session: str, one: Scanned, other: Scanned, config: ExtractConfig = CONFIG) -> list[PointGroup]:
+    before, after = (one, other) if session == "before" else (other, one)
+    return cut(before, after, config=config)
+
+
+@pytest.mark.parametrize("session", ["before", "after"])
+def test_a_wall_that_hangs_in_the_room_after_drift_is_no_change(session: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    twice = drifted((CRATE,), ((0.0, 0.0, 1.5),), -0.5)
+    (crate,) = both_ways(session, twice, scanned((), 1))
+    of_first_pass = {each for each in twice[0].returns_on(0) if each[0] < len(PATH)}
+    assert len(returns_of(twice[1], crate) & of_first_pass) > 0.9 * len(of_first_pass)
+    monkeypatch.setattr(cdpipe.extract.presence.Sight, "is_double", lambda _: False)
+    assert len(both_ways(session, twice, scanned((), 1), KEPT)) > 1
+
+
+HALL: Box = ((-5.0, -4.0, 0.0), (40.0, 4.0, 3.0))
+LOCKER: Box = ((1.0, 1.5, 0.0), (2.6, 3.1, 2.0))
+DOWN_THE_HALL = tuple((x, 0.0, 1.5) for x in np.arange(18.0, 36.0, 1.0).tolist())
+
+
+def in_the_hall(path: Sequence[tuple[float, float, float]], n_off: int = 0, off_m: float = 0.0) -> Scanned:
+    """A session in a long hall with a locker; of its first scans the odometry is off sideways."""
+    scans = RoomScans((LOCKER,), 2, path, room=HALL)
+    scans.odom_T_sensor[:n_off, 1, 3] += off_m
+    return scans, scans.mapped()
+
+
+@pytest.mark.parametrize("session", ["before", "after"])
+def test_what_only_scans_from_afar_show_is_no_change_where_the_session_came_near(
+    session: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cdpipe.extract.presence, "_DOUBLED", np.inf)  # as from near
+    monkeypatch.setattr(cdpipe.extract.presence, "_ON_ITS_WAY", np.inf)
+    right = in_the_hall((*DOWN_THE_HALL, *PATH))
+    off = in_the_hall((*DOWN_THE_HALL, *PATH), len(DOWN_THE_HALL), -1.2)
+    assert both_ways(session, off, right) == []
+    monkeypatch.setattr(cdpipe.extract.presence, "_DOUBLED_AFAR", np.inf)
+    hanging = both_ways(session, off, right)[0]  # the locker again, in front of itself
+    assert hanging.points_map[:, 1].max() < 1.5
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        tuple((x, 0.0, 1.5) for x in np.arange(13.8, 36.0, 0.7).tolist()),  # it came no nearer than 12 m
+        # it waited before it came
+        (*((18.0, 0.0, 1.5),) * 100, *((x, 0.0, 1.5) for x in np.arange(18.0, 8.0, -0.7).tolist())),
+        ((8.0, 0.0, 1.5), *DOWN_THE_HALL),  # one scan from near shows it too
+    ],
+)
+def test_a_thing_seen_mostly_from_afar_is_a_change_all_the_same(path: Sequence[tuple[float, float, float]]) -> None:
+    empty = RoomScans((), 1, (*DOWN_THE_HALL, *PATH), room=HALL)
+    after = in_the_hall(path)
+    found = set().union(*(returns_of(after[1], group) for group in cut((empty, empty.mapped()), after)))
+    assert iou(found, after[0].returns_on(0)) > 0.7
+    ranges_m = [np.linalg.norm(after[0].scan(scan).points_sensor[pixel]) for scan, pixel in found]
+    assert np.mean(np.array(ranges_m) > 15.0) > 0.5
+
+
+class Passing(RoomScans):
+    """A room in which a crate stands while some scans are taken, and is gone in the others."""
+
+    def __init__(self, scans: Sequence[int], path: Sequence[tuple[float, float, float]]) -> None:
+        super().__init__((), 2, path)
+        self._with, self._scans = RoomScans((CRATE,), 2, path), scans
+
+    def scan(self, index: int) -> PosedScan:
+        return self._with.scan(index) if index in self._scans else super().scan(index)
+
+
+ALONG = tuple((x, 0.0, 1.5) for x in np.arange(-2.0, 2.5, 0.5).tolist())
+
+
+@pytest.mark.parametrize("session", ["before", "after"])
+def test_a_crate_that_a_third_of_the_scans_saw_through_is_no_change(session: str) -> None:
+    for seen, is_change in ((range(9), True), (range(8), True), (range(4), False), ((4,), False)):
+        passing = Passing(seen, ALONG)
+        assert bool(both_ways(session, (passing, passing.mapped()), scanned((), 1))) == is_change, seen
+
+
+@pytest.mark.parametrize(
+    ("seen", "n_scans", "apart_m", "expected"),
+    [
+        ([5], 20, 0.5, True), ([5, 6, 6], 20, 0.5, True), ([5, 6, 7], 20, 0.5, False), ([5, 7], 20, 0.5, True),
+        ([0], 20, 0.5, True), ([19], 20, 0.5, True), ([5], 20, 10.0, False), ([0, 1], 2, 0.5, False),
+        ([0], 1, 0.5, False), ([2], 20, 0.0, True), ([5, 15], 20, 0.5, False),
+    ],
+)  # fmt: skip
+def test_one_or_two_scans_between_near_ones_are_fleeting(
+    seen: list[int], n_scans: int, apart_m: float, expected: bool
+) -> None:
+    poses = np.tile(np.eye(4), (n_scans, 1, 1))
+    poses[:, 0, 3] = apart_m * np.arange(n_scans)
+    assert is_fleeting(poses, np.unique(seen)) == expected
+
+
+@pytest.mark.parametrize("n_again", [3, 5, 7])
+def test_a_thing_that_stands_twice_after_drift_is_still_a_change(n_again: int) -> None:
+    tall: Box = ((-0.3, -0.3, 0.0), (0.3, 0.3, 1.6))
+    beside = tuple((x, 2.0, 1.5) for x, _, _ in PATH)
+    before = scanned((), 1)
+    path = tuple((x, -2.0, 1.5) for x, _, _ in PATH)
+    scans = RoomScans((tall,), 2, (*path, *beside[:n_again]))
+    scans.odom_T_sensor[len(path) :, 1, 3] -= 1.2
+    twice = scans, scans.mapped()
+    found = set().union(*(returns_of(twice[1], group) for group in cut(before, twice)))
+    first = {each for each in scans.returns_on(0) if each[0] < len(path)}
+    for of_pass in (first, scans.returns_on(0) - first):
+        assert len(found & of_pass) > 0.7 * len(of_pass)
+
+
+@pytest.mark.parametrize(("n_again", "is_found"), [(1, False), (3, True), (7, True)])
+def test_what_was_put_down_between_two_passes_is_a_change_if_the_second_was_no_glimpse(
+    n_again: int, is_found: bool
+) -> None:
+    without, with_crate = RoomScans((), 4), RoomScans((CRATE,), 5)
+
+    class Both(RoomScans):
+        def __init__(self) -> None:
+            self.name = "put down in between"
+            self.odom_T_sensor = np.concatenate([without.odom_T_sensor, with_crate.odom_T_sensor[:n_again]])
+
+        def scan(self, index: int) -> PosedScan:
+            if index < len(PATH):
+                return without.scan(index)
+            return replace(with_crate.scan(index - len(PATH)), index=index)
+
+        def scans(self) -> Iterator[PosedScan]:
+            return (self.scan(index) for index in range(len(self.odom_T_sensor)))
+
+    scans = Both()
+    found = cut(scanned((), 1), (scans, scans.mapped()))
+    assert bool(found) == is_found
+
+
+def test_maps_without_views_keep_what_they_cannot_judge() -> None:
+    twice = drifted((CRATE,), ((0.0, 0.0, 1.5),), -0.5)
+    with_views = both_ways("after", twice, scanned((), 1))
+    blind = both_ways("after", (twice[0], replace(twice[1], views=None)), scanned((), 1))
+    assert len(blind) > len(with_views) == 1
+
+
+# A person who stands: legs, hips, chest with arms, head.
+PERSON: tuple[Box, ...] = (
+    ((1.4, 1.55, 0.0), (1.55, 1.7, 0.8)),
+    ((1.4, 1.8, 0.0), (1.55, 1.95, 0.8)),
+    ((1.38, 1.58, 0.8), (1.6, 1.92, 1.0)),
+    ((1.38, 1.5, 1.0), (1.6, 2.0, 1.55)),
+    ((1.4, 1.67, 1.55), (1.58, 1.84, 1.8)),
+)
+AS_LARGE: Box = ((1.38, 1.5, 0.0), (1.6, 2.0, 1.8))
+KEPT = ExtractConfig(movers="keep")
+
+
+@pytest.mark.parametrize("session", ["before", "after"])
+def test_a_person_who_stands_is_no_change_and_a_locker_is(session: str) -> None:
+    empty = scanned((), 1)
+    assert both_ways(session, scanned(PERSON, 2), empty) == []
+    assert len(both_ways(session, scanned(PERSON, 2), empty, KEPT)) == 1
+    assert len(both_ways(session, scanned((AS_LARGE,), 2), empty)) == 1
+
+
+class Waiting(RoomScans):
+    """A hall in which a locker and a crate stand near the robot, and the locker is gone when the robot is far away."""
+
+    def __init__(self, n_with: int) -> None:
+        path = tuple((x, 0.0, 1.5) for x in np.arange(0.0, 36.0, 1.0).tolist())
+        super().__init__((CRATE_AFAR,), 2, path, room=HALL)
+        self._with, self._n_with = RoomScans((CRATE_AFAR, LOCKER), 2, path, room=HALL), n_with
+
+    def scan(self, index: int) -> PosedScan:
+        return self._with.scan(index) if index < self._n_with else super().scan(index)
+
+
+CRATE_AFAR: Box = ((3.4, 1.5, 0.0), (4.4, 2.3, 0.8))
+
+
+@pytest.mark.parametrize("session", ["before", "after"])
+def test_a_machine_that_left_when_the_robot_was_far_away_is_no_change(session: str) -> None:
+    empty = RoomScans((), 1, tuple((x, 0.0, 1.5) for x in np.arange(0.0, 36.0, 1.0).tolist()), room=HALL)
+    other = empty, empty.mapped()
+    for n_with, n_found in ((36, 2), (20, 1)):
+        waiting = Waiting(n_with)
+        found = both_ways(session, (waiting, waiting.mapped()), other)
+        assert len(found) == n_found, n_with
+    # the crate beside it, which the same scans hit and others, too, stays
+    assert found[0].points_map[:, 0].min() > 3.0
+    assert len(both_ways(session, (waiting, waiting.mapped()), other, KEPT)) == 2
