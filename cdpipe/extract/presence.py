@@ -44,8 +44,8 @@ _FLEETING_SCANS, _FLEETING_M = 2, 2.0
 _GONE, _GONE_WAY_M, _HIT_SHARE = 1.0, 60.0, 0.05
 # As far as a pixel is not larger than the object.
 _FARTHEST_M = 60.0
-# A part of a machine lies this near to the rest, and is hit by none but the scans that hit the rest.
-_PART_M = 1.5
+# A part of a machine lies this near to the rest, and is hit by none but the scans that hit the rest, and those around.
+_PART_M, _PART_WAY_M = 1.5, 2.0
 
 
 def keep_what_stands(merged: MergedMaps, objects: list[PointGroup], config: ExtractConfig) -> list[PointGroup]:
@@ -76,11 +76,15 @@ def keep_what_stands(merged: MergedMaps, objects: list[PointGroup], config: Extr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mover:
-    """What came or left while its session was recorded: (N, 3) points, odom frame, and the scans that hit it."""
+    """What came or left while its session was recorded.
+
+    Attributes:
+        points: (N, 3) points, odom frame, metres.
+        seen_m: First and last place on the session's way from which it was hit, metres.
+    """
 
     points: Float64Array
-    first_scan: int
-    last_scan: int
+    seen_m: tuple[float, float]
 
 
 class Sight:
@@ -94,6 +98,7 @@ class Sight:
         self._path_m = travelled_m(self._odom_T_sensor)
         self._cells, _ = cell_means(self._points, _CELL_M)
         self._seen = np.unique(self._scans)
+        self._seen_m = float(self._path_m[self._seen[0]]), float(self._path_m[self._seen[-1]])
         self._n_through, self._n_hit = through_and_hit_by_keyframe(self._cells, views)
 
     def is_double(self) -> bool:
@@ -127,7 +132,8 @@ class Sight:
 
     def is_part_of(self, mover: Mover) -> bool:
         """Return whether it is a part of a mover."""
-        is_during = self._seen[0] >= mover.first_scan and self._seen[-1] <= mover.last_scan
+        (first_m, last_m), (from_m, to_m) = self._seen_m, mover.seen_m
+        is_during = first_m >= from_m - _PART_WAY_M and last_m <= to_m + _PART_WAY_M
         return bool(is_during and np.min(cKDTree(mover.points).query(self._cells)[0]) <= _PART_M)
 
     def find_mover(self) -> Mover | None:
@@ -148,7 +154,7 @@ class Sight:
         is_behind = (at_m > hits_m[-1]) & (at_m < hits_m[-1] + _GONE_WAY_M)
         if max(n_through[is_far & each].sum() for each in (is_ahead, is_behind)) <= _GONE * len(places):
             return None
-        return Mover(self._cells, int(self._seen[0]), int(self._seen[-1]))
+        return Mover(self._cells, self._seen_m)
 
 
 def is_fleeting(odom_T_sensor: Float64Array, seen: Int64Array) -> bool:
