@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform, travelled_m
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, transform
 from cdpipe.core.geometry.groups import label_groups
 from cdpipe.core.geometry.voxel import cell_means
 from cdpipe.extract.crops import DIRECTIONS, SESSIONS, Crops, Sphere
@@ -32,7 +32,7 @@ from cdpipe.extract.surface import (
     measure_noise_m,
     unassigned_cells,
 )
-from cdpipe.mapping.free_space import free_space_votes, grazing_ray_count
+from cdpipe.mapping.free_space import free_space_votes, grazing_ray_count, views_of_one
 from cdpipe.merge.registration import MIN_SPHERE_POINTS, Surface, align_to_planes
 from cdpipe.model.config import ExtractConfig
 from cdpipe.model.report import ChangeRegions
@@ -47,8 +47,6 @@ _MAX_SHIFT_M = 0.4
 _MIN_TELLING = 2
 # Height above the surface below which a range image cannot show free space.
 _LOW_M = 0.3
-# Keyframes and scans that lie farther apart than this stand for several.
-_VIEW_M = 3.0
 _UNKNOWN_VIEWS = np.int64(1 << 20)
 
 
@@ -205,14 +203,8 @@ def _ask_for_views(point_map: PointMap, config: ExtractConfig) -> tuple[ExtractC
     A tripod that stands every 10 m looks at a place from there alone, where a robot passes it with 25 keyframes.
     """
     scans, keyframes = point_map.odom_T_sensor, point_map.odom_T_sensor[point_map.keyframe_scans]
-    min_views = config.min_views / _count_views(keyframes)
-    return config.model_copy(update={"min_views": min_views}), round(MIN_SCANS_PAST / _count_views(scans))
-
-
-def _count_views(odom_T_sensor: Float64Array) -> float:
-    """Return how many views one of (K, 4, 4) poses stands for: one for every 3 m between them, 1 to 3."""
-    step_m = np.diff(travelled_m(odom_T_sensor))
-    return float(np.clip(np.median(step_m) / _VIEW_M, 1.0, MIN_SCANS_PAST)) if len(step_m) else 1.0
+    min_views = config.min_views / views_of_one(keyframes)
+    return config.model_copy(update={"min_views": min_views}), round(MIN_SCANS_PAST / views_of_one(scans))
 
 
 def find_object_cells(

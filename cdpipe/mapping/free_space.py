@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, travelled_m
 from cdpipe.core.geometry.voxel import cell_keys, nearest_image
 from cdpipe.model.types import Float16Array, KeyframeViews
 
@@ -26,6 +26,8 @@ _MARGIN_M = 0.2
 _NEAREST_M = 0.5
 # Beyond this range a pixel is wider than the objects.
 REACH_M = 15.0
+# Keyframes and scans of a tripod that lie farther apart than this stand for several.
+_VIEW_M, _MOST_VIEWS = 3.0, 3.0
 # Grazing rays are traced backwards from their return: cell size, nearest and farthest distance from the return.
 _CELL_M = 0.1
 _PAST_M = (0.1, 1.0)
@@ -104,6 +106,12 @@ def _look(
         in_view = np.flatnonzero((pixel >= 0) & (ranges_m >= _NEAREST_M) & (ranges_m <= reach_m))
         first_m, is_hit = _look_up(views.ranges_m[keyframe], pixel[in_view], ranges_m[in_view])
         yield keyframe, in_view, np.isfinite(first_m) & (first_m > ranges_m[in_view] + _MARGIN_M), is_hit
+
+
+def views_of_one(odom_T_sensor: Float64Array) -> float:
+    """Return how many views one of (K, 4, 4) poses stands for: one for every 3 m to the next, 1 to 3."""
+    step_m = np.diff(travelled_m(odom_T_sensor))
+    return float(np.clip(np.median(step_m) / _VIEW_M, 1.0, _MOST_VIEWS)) if len(step_m) else 1.0
 
 
 def grazing_ray_count(points: Float64Array, ends: Float64Array, origins: Float64Array, scans: Int64Array) -> Int64Array:

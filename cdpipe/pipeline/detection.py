@@ -19,6 +19,7 @@ from cdpipe.core.threads import THREADS
 from cdpipe.descriptors.describe import list_checkpoints, load_descriptors, use_threads
 from cdpipe.extract.extract import extract_changes, make_report
 from cdpipe.io.known_merge import require_rigid
+from cdpipe.mapping.free_space import views_of_one
 from cdpipe.mapping.poses.recorded_frames import regions_as_mapped, report_as_recorded
 from cdpipe.mapping.scanless import adapt_to_whole_maps
 from cdpipe.mapping.session_check import unit_hint
@@ -213,12 +214,15 @@ def merge_mapped(
 
 def _warn_of_few_views(mapped: Sequence[MappedSession], config: PipelineConfig) -> None:
     """Warn where the sessions have too few keyframes for any object to be seen through often enough."""
-    n_views = min(len(session.map.keyframe_scans) for session in mapped)
+    n_keyframes, n_views = min(
+        (len(poses), len(poses) * views_of_one(poses))
+        for poses in (each.map.odom_T_sensor[each.map.keyframe_scans] for each in mapped)
+    )
     if config.extract.method == "surface" and n_views < config.extract.min_views:
         asked = f"extract.min_views = {config.extract.min_views:g}"
         text = (
-            f"{n_views} keyframes in the shorter session, {asked}: no object is seen through often enough to be found: "
-            "record a path, or lower it (--set extract.min_views=0.5)"
+            f"{n_keyframes} keyframes in the shorter session, {asked}: no object is seen through often enough to be "
+            "found: record a path, or lower it (--set extract.min_views=0.5)"
         )
         warnings.warn(text, InputWarning, stacklevel=3)
 

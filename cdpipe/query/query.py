@@ -49,12 +49,17 @@ def find_regions(
     """
     query = config.query
     places = _Places(merged, before, after, query)
-    session = places.asked
+    if config.regions.source == "scan":
+        return _score_by_scans(merged, places, before, after, query)
+    session: SessionName = "before"
+    if places.gap_m > _GAP_M:
+        # asked at the keyframes of the robot; those between two stations count as near them
+        session = "after"
+        query = query.model_copy(update={"max_pair_m": max(query.max_pair_m, _GAP_SHARE * places.gap_m)})
+        places = _Places(merged, before, after, query)
     described = before if session == "before" else after
     radii_m = keyframe_radii(merged.map_of(session), described.keyframe_scans, query)
     match config.regions.source:
-        case "scan":
-            return _score_by_scans(merged, places, before, after, query)
         case "sphere":
             # a sphere descriptor covers 2 m of tunnel before and behind its keyframe
             scores = change_log_odds(merged, described, places.is_covered(session), config.sphere, session)
@@ -65,8 +70,7 @@ def find_regions(
                 lambda near, away_m: np.minimum(scores[near], _SURE) - _FALL_PER_M * away_m,
             )
         case "sphere-difference":
-            near = query.model_copy(update={"max_pair_m": places.max_pair_m})
-            scores = sphere_difference(merged, before, after, near, session)
+            scores = sphere_difference(merged, before, after, query, session)
             keyframe_scores = score_keyframes_by_share(scores, merged, before, after, query, session)
         case "every-keyframe":
             scores = np.where(places.is_covered(session), 0.0, np.nan)
@@ -107,15 +111,15 @@ class _Places:
 
     def __init__(self, merged: MergedMaps, before: DescriptorSet, after: DescriptorSet, config: QueryConfig) -> None:
         self.before, self.after = merged.keyframe_positions(before, after)
-        # it is asked at the keyframes of the before session what changed, unless they leave gaps
-        step_b, step_a = (_usual_step_m(each) for each in (self.before, self.after))
-        has_gaps = step_b > max(_GAP_M, step_a)
-        self.asked: SessionName = "after" if has_gaps else "before"
-        # then what lies between two of them counts as theirs
-        self.max_pair_m = max(config.max_pair_m, _GAP_SHARE * step_b) if has_gaps else config.max_pair_m
         gap_b, self.near_a = query_nearest(self.before, self.after)
         gap_a, self.near_b = query_nearest(self.after, self.before)
-        self.is_covered_b, self.is_covered_a = gap_b <= self.max_pair_m, gap_a <= self.max_pair_m
+        self.is_covered_b, self.is_covered_a = gap_b <= config.max_pair_m, gap_a <= config.max_pair_m
+
+    @property
+    def gap_m(self) -> float:
+        """Usual distance of two before keyframes, if the after keyframes lie closer together; else 0."""
+        step_b, step_a = (_usual_step_m(each) for each in (self.before, self.after))
+        return step_b if step_b > step_a else 0.0
 
     def of(self, session: SessionName) -> Float64Array:
         """(K, 3) positions of the keyframes of a session."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
-from cdpipe.mapping.free_space import COLUMNS, ROWS, free_space_votes, grazing_ray_count, render_view
+from cdpipe.mapping.free_space import COLUMNS, ROWS, free_space_votes, grazing_ray_count, render_view, views_of_one
 from cdpipe.model.types import KeyframeViews
 from tests.cdpipe.rooms import ROOM, Box, cast
 
@@ -204,3 +204,15 @@ def test_rays_that_pass_equal_their_slow_twin(seed: int) -> None:
         expected.append(len(passed) - len(hit))
     assert len(set(expected)) >= 4
     np.testing.assert_array_equal(grazing_ray_count(places, ends, origins, scans), expected)
+
+
+@pytest.mark.parametrize(
+    ("x_m", "expected"),
+    [
+        ([], 1.0), ([5.0], 1.0), ([0.0, 1.0, 2.0, 3.0], 1.0), ([0.0, 6.0], 2.0), ([0.0, 10.0, 20.0], 3.0),
+        ([0.0, 1.0, 2.0, 50.0], 1.0),  # one gap makes no survey
+    ],
+)  # fmt: skip
+def test_stations_that_lie_apart_stand_for_several_views(x_m: list[float], expected: float) -> None:
+    poses = np.array([make_pose(translation=(x, 0.0, 0.0)) for x in x_m]).reshape(-1, 4, 4)
+    assert views_of_one(poses) == expected

@@ -237,6 +237,10 @@ def test_between_the_stations_of_a_survey_it_is_asked_at_the_keyframes_of_the_ro
     pairs = dict(zip(found.pairs[:, 1].tolist(), found.pairs[:, 0].tolist(), strict=True))
     assert [pairs[k] for k in (0, 4, 6, 14, 16, 25)] == [0, 0, 1, 1, 2, 2]
     assert found.keyframe_scores.tolist() == [0.0, 0.0, 0.0]
+    # the paper asks at the keyframes of both sessions, each within 5 m of its partner
+    paper = find_regions(merged, STATIONS[1], DRIVE[1], by("scan", reading="paired", suppression=1e-9))
+    of_drive = sorted(paper.centres_map[paper.direction == 1][:, 0].tolist())
+    assert of_drive == [x for x in range(31) if x % 10 != 5 and x < 25]
     # the other way round the stations are the after session, and two drives have no gaps
     for before, after in ((DRIVE, STATIONS), (DRIVE, DRIVE)):
         merged = MergedMaps(before[0], after[0], make_pose(), {}, True)
