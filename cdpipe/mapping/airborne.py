@@ -24,7 +24,10 @@ from cdpipe.model.types import PointMap, PosedScan, ScanSource, WrappedScans
 # mist with 12, 20 and 40 m of visibility 0.8, 0.01 and 0.00 % of what is left are returns of the mist, and 9, 6 and 4 %
 # of the surfaces are lost.
 _FARTHEST_M = 20.0
-_NEAR_M, _NEAR_PHOTONS = 3.0, 10
+# Too dark for a surface: fewer photons than this within such a range. Mist of 5 m of visibility lies so near to the
+# sensor that neighbours agree (`dust/mist` 10013): 99 % of its returns within 1 m have 17 photons at most, rock behind
+# as much of it 14 and more.
+_DARK = ((1.0, 16), (3.0, 10))
 _DUSTY_SHARE = 0.01
 # A cell of this size is on a surface if it holds so many returns that do not look airborne. In the dust of
 # `dust/narrow` 10001 objects lose two thirds of their returns otherwise (object IoU 0.34). On `dust/narrow` and
@@ -141,13 +144,13 @@ def drop_airborne(scan: PosedScan, lies_on_surface: LiesOnSurface | None = None)
 
 
 def _mark(scan: PosedScan, signal: npt.NDArray[np.uint16], rule: _Rule) -> BoolArray:
-    """Mark the (N,) returns within 20 m that look airborne by a rule, and those too dark for a surface within 3 m."""
+    """Mark the (N,) returns within 20 m that look airborne by a rule, and those too dark for a surface."""
     squared_m2 = np.einsum("ij,ij->i", scan.points_sensor, scan.points_sensor)
     is_marked: BoolArray = (signal < rule.weak_photons) & (squared_m2 < _FARTHEST_M**2)
     weak = np.flatnonzero(is_marked)
     ranges_m = np.sqrt(squared_m2)
-    is_dark = (ranges_m[weak] < _NEAR_M) & (signal[weak] < _NEAR_PHOTONS)
-    is_marked[weak] = is_dark | ~_is_on_surface(scan, ranges_m, weak, rule)
+    is_dark = [(ranges_m[weak] < near_m) & (signal[weak] < photons) for near_m, photons in _DARK]
+    is_marked[weak] = np.logical_or(*is_dark) | ~_is_on_surface(scan, ranges_m, weak, rule)
     return is_marked
 
 

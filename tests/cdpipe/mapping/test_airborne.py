@@ -81,6 +81,11 @@ def test_what_is_near_and_nearly_black_is_mist_though_it_looks_like_a_surface() 
     assert dropped(scan_of(ranges_m, signal)) == sorted([*MIST, *range(60, 70)])
     signal[60:70] = 12
     assert dropped(scan_of(ranges_m, signal)) == MIST
+    # nearer still
+    ranges_m[60:70] = 0.6
+    assert dropped(scan_of(ranges_m, signal)) == sorted([*MIST, *range(60, 70)])
+    signal[60:70] = 20
+    assert dropped(scan_of(ranges_m, signal)) == MIST
     dark = scan_of(np.full(WIDTH, 1.5), np.full(WIDTH, 8))
     assert drop_airborne(dark) is dark  # nothing would be left
 
