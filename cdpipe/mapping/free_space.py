@@ -175,8 +175,8 @@ def _look_up(image: Float16Array, pixel: Int64Array, ranges_m: Float64Array) -> 
     """Return the shortest range in each pixel's neighbourhood, and whether any equals the point's.
 
     The neighbourhood is the pixel and the four around it. Few beams leave rows empty, and for the range the next row
-    counts. The range is infinite where nothing returned, and 0 where the pixel is empty and has no beam on one side, so
-    that what is there may lie between two.
+    counts. The range is infinite where nothing returned, and 0 where the pixel and the one above or below it are empty:
+    what is there may lie between two beams.
     """
     column, row_start = pixel % COLUMNS, pixel - pixel % COLUMNS
     flat = image.ravel()
@@ -184,10 +184,10 @@ def _look_up(image: Float16Array, pixel: Int64Array, ranges_m: Float64Array) -> 
     sides = [flat.take(row_start + (column + step) % COLUMNS) for step in (1, -1)]
     seen_m = np.stack([*rows, *sides]).astype(np.float64)
     is_hit = np.asarray(np.any(np.abs(seen_m - ranges_m) <= _MARGIN_M, axis=0))
+    is_between = (seen_m[0] == 0) & ((seen_m[1] == 0) | (seen_m[2] == 0))
     for row, step in ((1, -2), (2, 2)):
         is_empty = np.flatnonzero(seen_m[row] == 0)
         seen_m[row, is_empty] = flat.take(_move(pixel[is_empty], step))
-    is_between = (seen_m[0] == 0) & ((seen_m[1] == 0) | (seen_m[2] == 0))
     seen_m[seen_m == 0] = np.inf
     return np.where(is_between, 0.0, seen_m.min(axis=0)), is_hit
 

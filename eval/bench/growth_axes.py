@@ -164,7 +164,8 @@ def _way_m(n: float) -> float:
 
 def _cut(meter: StageMeter, length_m: float, heaps_m: Float64Array, regions_m: Float64Array) -> int:
     """Cut objects out of regions on the way of two sessions whose merge is known; return the number of objects."""
-    config = load_config("tunnelcd", ["map.consistency=none", "merge.refine=none"])
+    # these heaps hide nothing from afar, so a session sees through its own, as through what passes
+    config = load_config("tunnelcd", ["map.consistency=none", "merge.refine=none", "extract.movers=keep"])
     sessions, before_T_after = _corridors(meter, length_m, 2.0, heaps_m)
     mapped = map_pair(sessions, config, meter).value
     way_m = sessions[0].odom_T_sensor[:, :3, 3]

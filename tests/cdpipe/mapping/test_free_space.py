@@ -136,7 +136,7 @@ def test_looking_up_equals_its_slow_twin(seed: int) -> None:
             # the next row with a beam, or the one after it
             above, below = (near or far for near, far in (up, down))
             seen = [each for each in (*level, above, below) if each > 0]
-            is_between = level[0] == 0 and (above == 0 or below == 0)
+            is_between = level[0] == 0 and (up[0] == 0 or down[0] == 0)
             balance += bool(seen) and not is_between and min(seen) > range_m + 0.2
             balance -= any(each > 0 and abs(each - range_m) <= 0.2 for each in (*level, up[0], down[0]))
         expected.append(balance)
