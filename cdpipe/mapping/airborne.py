@@ -24,7 +24,7 @@ from cdpipe.model.types import PointMap, PosedScan, ScanSource, WrappedScans
 # mist with 12, 20 and 40 m of visibility 0.8, 0.01 and 0.00 % of what is left are returns of the mist, and 9, 6 and 4 %
 # of the surfaces are lost.
 _FARTHEST_M = 20.0
-# Too dark for a surface: fewer photons than this within such a range. Mist of 5 m of visibility lies so near to the
+# Too dark for a surface: fewer photons than this within such a range. Mist of 12 m of visibility lies so near to the
 # sensor that neighbours agree (`dust/mist` 10013): 99 % of its returns within 1 m have 17 photons at most, rock behind
 # as much of it 14 and more.
 _DARK = ((1.0, 16), (3.0, 10))
