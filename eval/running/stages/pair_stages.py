@@ -25,6 +25,7 @@ from cdpipe.model.config import MapConfig, PipelineConfig
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import MappedSession, PointMap, ScanSource
 from cdpipe.pipeline import Done, Hooks, Merge, Propose, Stage, T, detect_changes, detect_merge, map_pair, map_sources
+from cdpipe.query.query import AFTER
 from eval.plans.variants import Until
 from eval.running.stages.stage_cache import Kept, StageCache
 from eval.running.stages.stage_results import is_kept, name_result, pack, unpack
@@ -125,7 +126,10 @@ class PairStages(Hooks):
             is_described = merge is None and config.merge.method != "kiss-matcher"
         else:
             report = detect_changes(*mapped.value, config, self, merge=merge, propose=propose)
-            report = replace(report, evidence={**report.evidence, **kept_bytes(mapped.value[0], config)})
+            asked = report.regions.direction
+            is_asked_after = asked is not None and len(asked) > 0 and bool(np.all(asked == AFTER))
+            kept = kept_bytes(mapped.value[0], config, is_asked_after=is_asked_after)
+            report = replace(report, evidence={**report.evidence, **kept})
             is_described = propose is None and load_source(config).uses_descriptors
         return replace(report, seconds={**report.seconds, **self._of_descriptors(mapped.seconds, is_described)})
 
@@ -162,16 +166,18 @@ def time_parts(compute: Callable[[], Done[T]], clock: Callable[[], float] = time
     return Done(done.value, {name: statistics.median(run[name] for run in runs) for name in done.seconds})
 
 
-def kept_bytes(before: MappedSession, config: PipelineConfig) -> dict[str, float]:
+def kept_bytes(before: MappedSession, config: PipelineConfig, *, is_asked_after: bool = False) -> dict[str, float]:
     """Return the bytes of the thinned before map, and of what a method keeps of that session to find regions.
 
     All as float32: x, y, z of every map point; for a descriptor one vector and one pose (7 numbers) per keyframe, and
     the width of the drift where the radius follows it. Random regions and every keyframe need no vector. Any other
-    source keeps the map; those that read single scans also keep the returns of these.
+    source keeps the map; those that read single scans also keep the returns of these. Spheres keep it where the
+    keyframes of the after session are asked, as between the stations of a survey: the before map is rendered there.
     """
     map_bytes = 12.0 * len(before.map.points)
     source = config.regions.source
-    vectors = {"scan": before.descriptors.q, "sphere": before.descriptors.spheres}.get(source)
+    spheres = None if is_asked_after else before.descriptors.spheres
+    vectors = {"scan": before.descriptors.q, "sphere": spheres}.get(source)
     n_keyframes = len(before.map.keyframe_scans)
     pose_bytes = _POSE_BYTES + (4.0 if config.query.radius_m == "width" else 0.0)
     if source in ("random-regions", "every-keyframe"):

@@ -267,6 +267,12 @@ def test_bytes_kept_by_hand(settings: list[str], per_keyframe: int, per_point: i
     assert found == {"bytes_map_before": 12000.0, "bytes_regions_before": 10.0 * per_keyframe + 1000.0 * per_point}
 
 
+def test_a_survey_keeps_its_map_where_the_robot_asks() -> None:
+    survey = mapped(1000, 10, has_spheres=True)
+    found = kept_bytes(survey, load_config("tunnelcd", ["regions.source=sphere"]), is_asked_after=True)
+    assert found["bytes_regions_before"] == 12000.0
+
+
 PLAN = {
     "name": "tiny", "scenarios": ["smoke/one_box"], "seeds": [10300], "report": "regions",
     "variants": [{"preset": "voxel-diff"}, {"preset": "random-regions"}],
