@@ -9,6 +9,8 @@ pixel. For it the single rays decide that returned from the floor just behind it
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,8 +38,8 @@ _PAST_M = (0.1, 1.0)
 def render_view(points_sensor: Float64Array, airborne_sensor: Float64Array | None = None) -> Float16Array:
     """Return the (ROWS, COLUMNS) float16 range image: nearest return of each pixel, metres, 0 without one.
 
-    A pixel that holds returns of mist or dust alone has the nearest of them. Some are of dark rock, and what the rays
-    beside it see is no sign that they passed it.
+    A pixel that holds returns of mist or dust alone has the nearest of them, with a minus sign. Some are of dark rock,
+    and what the rays beside it see is no sign that they passed it.
 
     Args:
         points_sensor: (N, 3) returns of a scan, sensor frame, metres.
@@ -45,7 +47,8 @@ def render_view(points_sensor: Float64Array, airborne_sensor: Float64Array | Non
     """
     view = nearest_image(*_pixels(points_sensor), (ROWS, COLUMNS))
     if airborne_sensor is not None:
-        view = np.where(view == 0, nearest_image(*_pixels(airborne_sensor), (ROWS, COLUMNS)), view)
+        air = nearest_image(*_pixels(airborne_sensor), (ROWS, COLUMNS))
+        view = np.where(view == 0, 0.0 - air, view)  # no -0 where nothing returned
     return view.astype(np.float16)
 
 
@@ -69,15 +72,43 @@ def count_through_and_hit(points_odom: Float64Array, views: KeyframeViews) -> tu
     Arguments as of `free_space_votes`; keyframes farther than 15 m from a place are ignored.
     """
     n_through, n_hit = np.zeros((2, len(points_odom)), dtype=np.int64)
-    for _, in_view, is_through, is_hit in _look(points_odom, views, REACH_M):
-        n_through[in_view] += is_through
-        n_hit[in_view] += is_hit
+    for look in _look(points_odom, views, REACH_M):
+        n_through[look.places] += look.is_through
+        n_hit[look.places] += look.is_hit
     return n_through, n_hit
 
 
-def through_and_hit_by_keyframe(
-    points_odom: Float64Array, views: KeyframeViews, reach_m: float = REACH_M
-) -> tuple[Int64Array, Int64Array]:
+def is_veiled(points_odom: Float64Array, views: KeyframeViews) -> BoolArray:
+    """Mark the (N,) places that mist or dust hid from a session.
+
+    No keyframe saw through them or hit them, and in the pixel of some keyframe air alone returned.
+
+    Arguments as of `free_space_votes`.
+    """
+    is_seen, is_air = np.zeros((2, len(points_odom)), dtype=np.bool_)
+    for look in _look(points_odom, views, REACH_M):
+        is_seen[look.places] |= look.is_through | look.is_hit
+        is_air[look.places] |= look.pixel_m < 0
+    return is_air & ~is_seen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Looks:
+    """How often each keyframe saw through some of (N, 3) places, and how often it hit them.
+
+    Attributes:
+        n_through, n_hit: (K,) places, as for `free_space_votes`.
+        n_pixel_through, n_pixel_hit: (K,) places by the pixel alone, without those around it. A return of mist is no
+            hit.
+    """
+
+    n_through: Int64Array
+    n_hit: Int64Array
+    n_pixel_through: Int64Array
+    n_pixel_hit: Int64Array
+
+
+def look_by_keyframe(points_odom: Float64Array, views: KeyframeViews, reach_m: float = REACH_M) -> Looks:
     """Return how many of (N, 3) places each of the (K,) keyframes saw through, and how many it hit.
 
     Args:
@@ -85,16 +116,34 @@ def through_and_hit_by_keyframe(
         views: Range images of its keyframes.
         reach_m: Places farther from a keyframe are ignored; beyond 15 m a pixel is wider than small objects.
     """
-    n_through, n_hit = np.zeros((2, len(views.ranges_m)), dtype=np.int64)
-    for keyframe, _, is_through, is_hit in _look(points_odom, views, reach_m):
-        n_through[keyframe], n_hit[keyframe] = np.count_nonzero(is_through), np.count_nonzero(is_hit)
-    return n_through, n_hit
+    counts = np.zeros((4, len(views.ranges_m)), dtype=np.int64)
+    for look in _look(points_odom, views, reach_m):
+        marks = (
+            look.is_through,
+            look.is_hit,
+            np.abs(look.pixel_m) > look.ranges_m + _MARGIN_M,
+            np.abs(look.pixel_m - look.ranges_m) <= _MARGIN_M,
+        )
+        counts[:, look.keyframe] = [np.count_nonzero(mark) for mark in marks]
+    return Looks(*counts)
 
 
-def _look(
-    points_odom: Float64Array, views: KeyframeViews, reach_m: float
-) -> Iterator[tuple[int, Int64Array, BoolArray, BoolArray]]:
-    """Yield each keyframe that can see some of (N, 3) places: the places in view, and whether it saw through or hit."""
+class _Look(NamedTuple):
+    """One keyframe and the (M,) of (N, 3) places in its view, their ranges, and whether it saw through or hit them.
+
+    `pixel_m` (M,) is the range in the pixel of each, as `render_view` writes it.
+    """
+
+    keyframe: int
+    places: Int64Array
+    ranges_m: Float64Array
+    pixel_m: Float64Array
+    is_through: BoolArray
+    is_hit: BoolArray
+
+
+def _look(points_odom: Float64Array, views: KeyframeViews, reach_m: float) -> Iterator[_Look]:
+    """Yield each keyframe that can see some of (N, 3) places."""
     if len(points_odom) == 0 or len(views.ranges_m) == 0:
         return
     centre = points_odom.mean(axis=0)
@@ -104,8 +153,10 @@ def _look(
     for keyframe in np.flatnonzero(distances_m <= reach_m + spread_m).tolist():
         pixel, ranges_m = _pixels(points_odom @ rotations[keyframe].T + shifts[keyframe])
         in_view = np.flatnonzero((pixel >= 0) & (ranges_m >= _NEAREST_M) & (ranges_m <= reach_m))
-        first_m, is_hit = _look_up(views.ranges_m[keyframe], pixel[in_view], ranges_m[in_view])
-        yield keyframe, in_view, np.isfinite(first_m) & (first_m > ranges_m[in_view] + _MARGIN_M), is_hit
+        pixel, ranges_m = pixel[in_view], ranges_m[in_view]
+        pixel_m, first_m, is_hit = _look_up(views.ranges_m[keyframe], pixel, ranges_m)
+        is_through = np.isfinite(first_m) & (first_m > ranges_m + _MARGIN_M)
+        yield _Look(keyframe, in_view, ranges_m, pixel_m, is_through, is_hit)
 
 
 def views_of_one(odom_T_sensor: Float64Array) -> float:
@@ -171,8 +222,10 @@ class _Cells:
         return cell_keys(points - self._low, _CELL_M)
 
 
-def _look_up(image: Float16Array, pixel: Int64Array, ranges_m: Float64Array) -> tuple[Float64Array, BoolArray]:
-    """Return the shortest range in each pixel's neighbourhood, and whether any equals the point's.
+def _look_up(
+    image: Float16Array, pixel: Int64Array, ranges_m: Float64Array
+) -> tuple[Float64Array, Float64Array, BoolArray]:
+    """Return the range in each pixel, the shortest one in its neighbourhood, and whether any equals the point's.
 
     The neighbourhood is the pixel and the four around it. Few beams leave rows empty, and for the range the next row
     counts. The range is infinite where nothing returned, and 0 where the pixel and the one above or below it are empty:
@@ -182,14 +235,15 @@ def _look_up(image: Float16Array, pixel: Int64Array, ranges_m: Float64Array) -> 
     flat = image.ravel()
     rows = [flat.take(_move(pixel, step)) for step in (0, -1, 1)]
     sides = [flat.take(row_start + (column + step) % COLUMNS) for step in (1, -1)]
-    seen_m = np.stack([*rows, *sides]).astype(np.float64)
+    pixel_m = rows[0].astype(np.float64)
+    seen_m = np.abs(np.stack([*rows, *sides]).astype(np.float64))
     is_hit = np.asarray(np.any(np.abs(seen_m - ranges_m) <= _MARGIN_M, axis=0))
     is_between = (seen_m[0] == 0) & ((seen_m[1] == 0) | (seen_m[2] == 0))
     for row, step in ((1, -2), (2, 2)):
         is_empty = np.flatnonzero(seen_m[row] == 0)
-        seen_m[row, is_empty] = flat.take(_move(pixel[is_empty], step))
+        seen_m[row, is_empty] = np.abs(flat.take(_move(pixel[is_empty], step)))
     seen_m[seen_m == 0] = np.inf
-    return np.where(is_between, 0.0, seen_m.min(axis=0)), is_hit
+    return pixel_m, np.where(is_between, 0.0, seen_m.min(axis=0)), is_hit
 
 
 def _move(pixel: Int64Array, rows: int) -> Int64Array:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.geometry import Float64Array, invert, plane_jacobian, transform
+from cdpipe.mapping.free_space import is_veiled
 from cdpipe.merge.registration import IndexedMap, search_nearest
 from cdpipe.model.config import MergeConfig
 
@@ -31,6 +32,8 @@ BOTH_WAYS_M, BOTH_WAYS_DEG = 0.05, 0.5
 # Points sampled from a sphere, and the longest correspondence.
 _SAMPLES = 300
 _COUNTERPART_M = 0.5
+# Shares of points without a counterpart at which a session is asked whether mist hid them from it.
+_MISSING = (0.02, 0.5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +44,7 @@ class SurfaceFit:
         forward_m: (N,) point-to-plane distances of after points to the before map, metres; inf if the nearest point
             is over 0.5 m away.
         backward_m: (M,) the same for before points to the after map.
+            Points that mist or dust hid from the other session are in neither.
         information: (6, 6) Hessian of the forward distances: rotation, then translation, after odom axes about the
             place. If all normals are orthogonal to one direction, the translation along it is unconstrained.
     """
@@ -95,7 +99,22 @@ def measure_fit(
     nearest, squared_m2 = after.nearest_near(centre_after, radius_m + _COUNTERPART_M, theirs)
     turned = fine.normals[chosen if rows is None else np.searchsorted(rows, chosen)] @ before_T_after[:3, :3]
     backward_m = plane_distances(theirs, nearest, turned, squared_m2)
-    return SurfaceFit(forward_m, backward_m, information)
+    return SurfaceFit(
+        _without_veiled(forward_m, moved, before), _without_veiled(backward_m, theirs, after), information
+    )
+
+
+def _without_veiled(distances_m: Float64Array, points: Float64Array, other: IndexedMap) -> Float64Array:
+    """Return the distances without those of (N, 3) points that the other session could not see for mist or dust.
+
+    Only a few points without a counterpart are asked about: of half of them, the alignment is wrong.
+    """
+    is_missing, views = np.isinf(distances_m), other.map.views
+    least, most = (share * len(distances_m) for share in _MISSING)
+    if views is None or not least < np.count_nonzero(is_missing) < most or not other.has_mist:
+        return distances_m
+    is_missing[is_missing] = is_veiled(points[is_missing], views)
+    return distances_m[~is_missing]
 
 
 def sample_evenly(of_map: npt.NDArray[Any], n: int = _SAMPLES) -> npt.NDArray[Any]:

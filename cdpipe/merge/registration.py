@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from time import perf_counter
 from typing import Any
 
@@ -112,6 +113,11 @@ class IndexedMap:
         self._fine = Surface(self.points) if is_whole else None
         self._coarse = Surface(self.points, config.coarse_voxel_m) if is_whole and has_coarse_target else None
         self._tree = None if is_target or is_local else small_gicp.KdTree(self.points)
+
+    @cached_property
+    def has_mist(self) -> bool:
+        """Whether the session met mist or dust, as far as its range images tell."""
+        return self.map.views is not None and self.map.views.has_mist()
 
     @property
     def target(self) -> Surface:

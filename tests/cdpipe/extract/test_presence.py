@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import cdpipe.extract.presence
+from cdpipe.core.geometry import stream
 from cdpipe.extract.objects import PointGroup
 from cdpipe.extract.presence import is_fleeting
 from cdpipe.model.config import ExtractConfig
@@ -57,6 +58,7 @@ def test_what_only_scans_from_afar_show_is_no_change_where_the_session_came_near
 ) -> None:
     monkeypatch.setattr(cdpipe.extract.presence, "_DOUBLED", np.inf)  # as from near
     monkeypatch.setattr(cdpipe.extract.presence, "_ON_ITS_WAY", np.inf)
+    monkeypatch.setattr(cdpipe.extract.presence, "_PALE", np.inf)
     right = in_the_hall((*DOWN_THE_HALL, *PATH))
     off = in_the_hall((*DOWN_THE_HALL, *PATH), len(DOWN_THE_HALL), -1.2)
     assert both_ways(session, off, right) == []
@@ -102,6 +104,31 @@ def test_a_crate_that_a_third_of_the_scans_saw_through_is_no_change(session: str
     for seen, is_change in ((range(9), True), (range(8), True), (range(4), False), ((4,), False)):
         passing = Passing(seen, ALONG)
         assert bool(both_ways(session, (passing, passing.mapped()), scanned((), 1))) == is_change, seen
+
+
+class Plume(RoomScans):
+    """A room in which few of the rays that meet a crate return from it."""
+
+    def __init__(self, share: float) -> None:
+        super().__init__((), 2, ALONG)
+        self._crate = RoomScans((CRATE,), 2, ALONG)
+        self._is_met = [stream(scan, "met").random(len(hits)) < share for scan, hits in enumerate(self.hits)]
+
+    def scan(self, index: int) -> PosedScan:
+        empty, full = super().scan(index), self._crate.scan(index)
+        points = np.where(self._is_met[index][:, None], full.points_sensor, empty.points_sensor)
+        return replace(empty, points_sensor=points)
+
+
+def test_what_few_rays_meet_is_no_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    before, plume, crate = scanned((), 1), Plume(0.14), Plume(0.5)
+    (found,) = cut(before, (crate, crate.mapped()))
+    assert len(found.returns if found.returns is not None else []) > 1000
+    after = plume, plume.mapped()
+    assert cut(before, after) == []
+    # by the five pixels around each place, as free space is told elsewhere, it stands there
+    monkeypatch.setattr(cdpipe.extract.presence, "_PALE", np.inf)
+    assert len(cut(before, after)) == 1
 
 
 @pytest.mark.parametrize(

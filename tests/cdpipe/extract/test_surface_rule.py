@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 import cdpipe.extract.objects
+import cdpipe.extract.surface_rule
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.extract.objects import PointGroup, ReturnPool
 from cdpipe.extract.surface_rule import cut_by_surface, realign
@@ -124,6 +125,18 @@ def test_an_object_between_two_regions_is_one() -> None:
     assert iou(returns_of(after[1], alone), returns_of(after[1], group)) > 0.98
 
 
+def test_a_long_site_is_compared_region_by_region(monkeypatch: pytest.MonkeyPatch) -> None:
+    before, after = scanned((), 1), scanned((BEAM,), 2)
+    centres = [(1.9, 2.2, 0.5), (-1.9, 2.2, 0.5)]
+    (whole,) = cut(before, after, centres, radius_m=1.9)
+    monkeypatch.setattr(cdpipe.extract.surface_rule, "_LONG_SITE_M", 2.0)
+    parts = cut(before, after, centres, radius_m=1.9)
+    assert [part.region for part in parts] == [0, 1]
+    one, other = (returns_of(after[1], part) for part in parts)
+    assert not one & other and min(len(one), len(other)) > 1000
+    assert iou(one | other, returns_of(after[1], whole)) > 0.98
+
+
 def test_what_lies_out_of_all_spheres_is_not_looked_at() -> None:
     before, after = scanned((), 1), scanned((CRATE, BARREL), 2)
     (group,) = cut(before, after, [(-1.9, -2.2, 0.3)], radius_m=1.0)
@@ -150,6 +163,14 @@ def test_what_the_other_session_never_saw_is_no_change() -> None:
     assert cut(kept_out, inside, centres) == []
     assert cut(inside, kept_out, centres) == []
     assert cut(glanced, inside, centres) == []  # one keyframe is not enough
+    twice = scanned((partition,), 4, (*near, (2.8, -1.0, 1.5), (2.8, 0.5, 1.5)))
+    assert cut(twice, inside, centres) == []  # nor are two, but in mist
+    assert twice[1].views is not None
+    met = twice[1].views.ranges_m.copy()
+    met[0, 0, 0] = -0.7
+    misty = twice[0], replace(twice[1], views=replace(twice[1].views, ranges_m=met))
+    (in_mist,) = cut(misty, inside, centres)
+    assert iou(returns_of(inside[1], in_mist), inside[0].returns_on(1)) > 0.9
     (group,) = cut(looked, inside, centres)
     assert iou(returns_of(inside[1], group), inside[0].returns_on(1)) > 0.9
     # nobody remembers what was seen through: then everything that stands off is new

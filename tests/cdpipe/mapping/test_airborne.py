@@ -15,7 +15,7 @@ from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
 from cdpipe.mapping import airborne
 from cdpipe.mapping.airborne import ClearScans, LiesOnSurface, clear_air, drop_airborne
-from cdpipe.mapping.free_space import PIXEL_HEIGHT_RAD, free_space_votes, render_view
+from cdpipe.mapping.free_space import PIXEL_HEIGHT_RAD, free_space_votes, is_veiled, render_view
 from cdpipe.mapping.mapping import build_map
 from cdpipe.model.config import MapConfig, load_config
 from cdpipe.model.types import KeyframeViews, PosedScan, WrappedScans
@@ -103,6 +103,11 @@ def test_a_place_from_which_returns_were_dropped_was_not_seen_through() -> None:
     images = [render_view(np.concatenate([scan.points_sensor, *beside]), airborne) for airborne in (None, patch)]
     votes = [free_space_votes(patch, KeyframeViews(image[None], np.eye(4)[None])) for image in images]
     assert votes[0].max() == 1 and votes[1].max() == 0
+    # what lies behind the dropped returns was hidden by them; what the session saw, or what a wall hides, was not
+    behind, beyond = 1.5 * patch, 1.2 * level
+    views = [KeyframeViews(image[None], np.eye(4)[None]) for image in images]
+    assert is_veiled(behind, views[1]).all() and not is_veiled(behind, views[0]).any()
+    assert not is_veiled(0.5 * level[:20], views[1]).any() and not is_veiled(beyond[:20], views[1]).any()
     # a kept return of the same pixel decides: here the mist in front of it was dropped
     plain = render_view(scan.points_sensor)
     assert np.array_equal(render_view(scan.points_sensor, 0.5 * scan.points_sensor), plain)

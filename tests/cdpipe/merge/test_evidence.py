@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cdpipe.core.geometry import Float64Array, make_pose, yaw_pose
+from cdpipe.core.geometry import Float64Array, invert, make_pose, transform, yaw_pose
+from cdpipe.mapping.free_space import render_view
 from cdpipe.merge.evidence import SurfaceFit, explain_refusal, measure_fit, sample_evenly
 from cdpipe.merge.registration import IndexedMap
 from cdpipe.model.config import MergeConfig
-from cdpipe.model.types import MappedSession
+from cdpipe.model.types import Float16Array, KeyframeViews, MappedSession
 
 CONFIG = MergeConfig()
 GOOD = {"overlap": 0.5, "inlier_share": 0.95, "hessian_ratio": 0.1, "agreement": 0.95, "distinctness": 10.0}
@@ -56,6 +57,30 @@ def test_what_has_no_counterpart_does_not_fit(floors: tuple[IndexedMap, IndexedM
     assert fit.inlier_share(10.0) == 0.0
     # where the other map has nothing at all, there is no point of it to look at either
     assert fit_at(floors, make_pose(translation=(300.0, 0, 0))).inlier_share(0.1) == 0.0
+
+
+def test_what_mist_hid_from_the_other_session_counts_for_nothing(floors: tuple[IndexedMap, IndexedMap]) -> None:
+    before, after = floors
+    # the first session met mist on one side: there it has no floor within 0.5 m of that of the second
+    is_hidden = before.map.points[:, 0] > 2.0
+    half = replace(before.map, points=before.map.points[~is_hidden], nearest_m=before.map.nearest_m[~is_hidden])
+    sensor = make_pose(translation=(0.0, 0.0, 1.0))
+    dense = floor(6.0, 0.02)
+    met = transform(invert(sensor), dense[dense[:, 0] > 2.0])
+    clear = render_view(transform(invert(sensor), half.points))
+    misty = render_view(transform(invert(sensor), half.points), 0.3 * met)
+
+    def share(view: Float16Array | None, lift_m: float = 0.0) -> float:
+        views = None if view is None else KeyframeViews(view[None], invert(sensor)[None])
+        maps = (IndexedMap(replace(half, views=views), CONFIG, is_target=True), after)
+        return fit_at(maps, make_pose(translation=(0, 0, lift_m))).inlier_share(0.1)
+
+    assert 0.6 < share(None) < 0.9
+    assert share(clear) == share(None)
+    assert share(misty) == pytest.approx(1.0)
+    # what the session did see is no better for it, nor is an alignment that leaves most points without a counterpart
+    assert share(misty, 0.2) == 0.0
+    assert share(misty, 0.6) == share(clear, 0.6) == 0.0
 
 
 def test_the_lower_of_both_directions_counts() -> None:
