@@ -171,16 +171,16 @@ def _find_sites(
             own = crops.near(session, points[members], SITE_M)
             parts = [(int(region[members[is_telling[members]]].min()), members, own)]
             if np.ptp(points[members], axis=0).max() > _LONG_SITE_M:
-                of_map = merged.to_map(session, merged.map_of(session).points.take(own, axis=0))
-                nearest = members[cKDTree(points[members]).query(of_map)[1]]
+                own_points = merged.to_map(session, merged.map_of(session).points.take(own, axis=0))
+                region_of_own = region[members[cKDTree(points[members]).query(own_points)[1]]]
                 n_telling = np.bincount(region[members], is_telling[members])
                 parts = [
-                    (each, members[region[members] == each], own[region[nearest] == each])
+                    (each, members[region[members] == each], own[region_of_own == each])
                     for each in np.flatnonzero(n_telling >= _MIN_TELLING).tolist()
                 ]
-            for best, candidates, own in parts:
+            for best, candidates, own_part in parts:
                 others = crops.near(other, points[candidates], SITE_M + RIM_M)
-                sites.append(_Site(session, best, own, others, agreements[best]))
+                sites.append(_Site(session, best, own_part, others, agreements[best]))
     return sorted(sites, key=lambda site: site.region)
 
 
