@@ -23,6 +23,7 @@ from scenarios import load_scenario
 from sim.sensor.air import AIR
 from sim.session.simulate import simulate_pair
 from sim.session.truth import read_labels
+from tests.cdpipe.rooms import RoomScans
 
 WIDTH = 100
 
@@ -222,6 +223,33 @@ def test_what_looks_airborne_on_a_surface_comes_back_and_the_air_does_not(pair: 
     assert set(
         zip(without.return_pixels.tolist(), without.scans_of(np.arange(len(seen))).tolist(), strict=True)
     ) <= set(zip(whole.return_pixels.tolist(), whole.scans_of(np.arange(len(left))).tolist(), strict=True))
+
+
+class Sparse(RoomScans):
+    """A session of few returns."""
+
+    def scan(self, index: int) -> PosedScan:
+        scan = super().scan(index)
+        return scan.keep(scan.pixels % 211 == 0)
+
+
+def test_dark_returns_come_back_from_a_surface_and_from_nowhere_else() -> None:
+    room = RoomScans((), 1)
+    scan = room.scan(3)
+    near = np.flatnonzero(np.linalg.norm(scan.points_sensor, axis=1) < 2.9)[::7]
+    on, before_it = near[::2], near[1::2]
+    points, signal = scan.points_sensor.copy(), np.full(len(scan.pixels), 60, np.uint16)
+    signal[near] = 5
+    points[before_it] *= 0.85
+    dark = replace(scan, points_sensor=points, signal=signal)
+    cleared = ClearScans(Held(dark))
+    assert len(near) > 500 and not np.isin(cleared.scan(3).pixels, scan.pixels[near]).any()
+    back = np.isin(scan.pixels, cleared.supported_by(room.mapped()).scan(3).pixels)
+    assert back[on].mean() > 0.9 and not back[before_it].any()
+    # a lone return is no surface
+    lone = Sparse((), 1).mapped()
+    assert len(lone.return_pixels) > 1000
+    assert not np.isin(scan.pixels, cleared.supported_by(lone).scan(3).pixels)[near].any()
 
 
 class ClearedOnce(WrappedScans):
