@@ -107,7 +107,8 @@ def measure_fit(
 def _without_veiled(distances_m: Float64Array, points: Float64Array, other: IndexedMap) -> Float64Array:
     """Return the distances without those of (N, 3) points that the other session could not see for mist or dust.
 
-    Only a few points without a counterpart are asked about: of half of them, the alignment is wrong.
+    Nothing is left out where more than half of the points have no counterpart, because then the alignment is wrong, or
+    where so few have none that they do not matter.
     """
     is_missing, views = np.isinf(distances_m), other.map.views
     least, most = (share * len(distances_m) for share in _MISSING)
