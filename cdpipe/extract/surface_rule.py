@@ -49,7 +49,7 @@ _MIN_TELLING = 2
 # Sites that are longer are cut at the regions. In mist the gaps of a map make candidates all along a drift.
 _LONG_SITE_M = 30.0
 # Share of `min_views` that a session is asked for if it met mist or dust. On 30 validation pairs of `dust/*` it finds
-# one change more of 82 (a pile that 2.1 keyframes saw through, 9.0 in clear air), and nothing that is none.
+# one change more of 80 (a pile that 2.1 keyframes saw through, 9.0 in clear air), and nothing that is none.
 _MISTY_SHARE = 0.6
 # Height above the surface below which a range image cannot show free space.
 _LOW_M = 0.3
