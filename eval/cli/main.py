@@ -16,6 +16,7 @@ from typer.core import TyperGroup
 from cdpipe.core.threads import fix_threads
 from eval.cli.commands import converting, leaderboard, pair, run, stories, tools, tracing, training, viewing, world
 from eval.core.terminal.exits import input_errors, run_app
+from eval.core.terminal.interrupts import interrupts_kept
 from eval.core.terminal.printing import echo
 
 
@@ -31,7 +32,7 @@ class _Funnel(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
         try:
-            with input_errors():
+            with input_errors(), interrupts_kept():
                 return super().invoke(ctx)
         except KeyboardInterrupt as error:
             kept = _KEPT.get(ctx.invoked_subcommand or "")

@@ -28,6 +28,7 @@ from cdpipe.model.config import WEIGHTS, MapConfig
 from eval.core.domains import domain_of
 from eval.core.output import remove
 from eval.core.provenance import canonical_json, digest_parts, git_commit, now
+from eval.core.terminal.interrupts import raise_lost_interrupt
 from eval.core.terminal.progress import RunProgress
 from eval.graft import make_pair
 from eval.oracles.merge import merged_by_truth
@@ -152,6 +153,7 @@ class PairRun:
         folder = self._run.answer(self._pair.name, self._pair.seed, cell.variant)
         try:
             _answer(stages, cell, truth, folder)
+            raise_lost_interrupt()  # before what it may have spoilt is scored
             self._finish(each, score_stored(truth, folder, may_end_early=True), is_contended=stages.is_contended)
         except BaseException as error:
             remove(folder)

@@ -23,6 +23,7 @@ from cdpipe.core.whole_file import whole_file
 from cdpipe.training.shard import FORMAT, FORMAT_VERSION, SUFFIX, read_about
 from eval.core.cluster import HERE, Where, connected, n_slots, require_usable
 from eval.core.output import make_writable
+from eval.core.terminal.interrupts import raise_lost_interrupt
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.plans.seeds import parse_seeds_option
 from eval.plans.worlds import world_slug
@@ -112,6 +113,7 @@ def make_dataset(
                 (out / name).unlink(missing_ok=True)  # of another digest, and not to be read any more
         with closing(_computed(todo, recipe, where)) as results:
             for n_done, (tunnel, result) in enumerate(results, start=1):
+                raise_lost_interrupt()
                 _keep(out, tunnel, result)
                 told = "refused"
                 if not isinstance(result, str):

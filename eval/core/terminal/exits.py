@@ -12,7 +12,7 @@ import typer
 
 from cdpipe.core.errors import TunnelcdError
 from cdpipe.core.names import visible
-from eval.core.terminal.interrupts import interruptible
+from eval.core.terminal.interrupts import interruptible, interrupts_kept
 
 # A full disk, a read-only one, a file too large for it, a folder or file of another user.
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EACCES, errno.EPERM)
@@ -57,7 +57,7 @@ def run_app(app: typer.Typer, name: str, words: Sequence[str], subcommands: Sequ
         subcommands: Names of the application's commands; a mistake in one of them names that command's --help.
     """
     try:
-        with interruptible(), input_errors():
+        with interruptible(), input_errors(), interrupts_kept():
             code = app(args=list(words), prog_name=name, standalone_mode=False)
     except typer.TyperException as error:
         command = " ".join([name, *(word for word in words[:1] if word in subcommands)])

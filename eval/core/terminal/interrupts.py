@@ -3,6 +3,9 @@
 Libraries swallow an interrupt that reaches them while they are imported, and then do without what they were importing
 (`try: import x / except BaseException`), or turn it into an `ImportError`. Ctrl-C also reaches every process of a
 terminal, also one that is just starting and knows no better than to print a traceback.
+
+An interrupt is not lost either: Python may make another error of it (`Condition.wait` of a lock that it has just let go
+raises "cannot release un-acquired lock"), or drop it (in `__del__` or a callback of C).
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from types import FrameType
 
 _AGAIN_S = 0.05
 _IMPORT = "<frozen importlib._bootstrap>"
+_raised: list[int] = []  # interrupts of the program that runs
 
 
 @contextmanager
@@ -29,6 +33,24 @@ def interruptible() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, handler)
+        _raised.clear()
+
+
+@contextmanager
+def interrupts_kept() -> Iterator[None]:
+    """Raise `KeyboardInterrupt` again where another error came of it."""
+    try:
+        yield
+    except Exception as error:
+        if _raised:
+            raise KeyboardInterrupt from error
+        raise
+
+
+def raise_lost_interrupt() -> None:
+    """Raise `KeyboardInterrupt` if one was raised before, so that whoever calls this does not know of it."""
+    if _raised:
+        raise KeyboardInterrupt
 
 
 @contextmanager
@@ -56,6 +78,7 @@ def interrupts_held() -> Iterator[None]:
 
 def _interrupt_or_wait(number: int, frame: FrameType | None) -> None:
     if not _is_importing(frame):
+        _raised.append(number)
         signal.default_int_handler(number, frame)
     again = Timer(_AGAIN_S, signal.raise_signal, (number,))
     again.daemon = True

@@ -435,7 +435,7 @@ def test_a_run_that_is_interrupted_goes_on_where_it_stopped(
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == 130, err
     assert err.endswith("interrupted; finished tunnels are kept, the same command goes on from there\n")
     assert "Traceback" not in err
     n_left = 3 - len(list((tmp_path / "d").glob("*.safetensors")))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import signal
 import subprocess
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from eval.core.terminal.interrupts import interruptible, interrupts_held
+from eval.core.terminal.interrupts import interruptible, interrupts_held, interrupts_kept, raise_lost_interrupt
 
 LIBRARY = """import signal
 try:
@@ -51,6 +52,26 @@ def test_an_interrupt_comes_at_once_without_an_import() -> None:
     with pytest.raises(KeyboardInterrupt), interruptible():
         signal.raise_signal(signal.SIGINT)
         pytest.fail("it waited")
+
+
+def test_what_a_library_makes_of_an_interrupt_is_an_interrupt() -> None:
+    with pytest.raises(KeyboardInterrupt) as caught, interruptible(), interrupts_kept():
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            raise RuntimeError("cannot release un-acquired lock")
+    assert isinstance(caught.value.__cause__, RuntimeError)
+    with pytest.raises(RuntimeError), interruptible(), interrupts_kept():
+        raise RuntimeError("nobody pressed anything")
+
+
+def test_an_interrupt_that_a_library_drops_comes_later() -> None:
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        with contextlib.suppress(BaseException):
+            signal.raise_signal(signal.SIGINT)
+        raise_lost_interrupt()
+    with interruptible():
+        raise_lost_interrupt()  # that was another program's
 
 
 def test_a_held_interrupt_comes_at_the_end_and_never_to_processes_started_meanwhile() -> None:
