@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 from cdpipe.core.geometry.groups import label_groups
 from cdpipe.core.spooled import SpooledArray
 from cdpipe.mapping.free_space import count_through_and_hit
@@ -38,7 +38,9 @@ _BLOCK_RETURNS = 1 << 22
 
 
 def drop_movers(point_map: PointMap) -> PointMap:
-    """Return a map without the points of movers and their returns; the same map where there are none.
+    """Return a map without the points of movers and their returns, which says what was left out of which scan.
+
+    It is the same map where there are none.
 
     Args:
         point_map: The map of one session, with range images of its keyframes.
@@ -51,7 +53,8 @@ def drop_movers(point_map: PointMap) -> PointMap:
     is_kept = ~find_movers(point_map.points, point_map.views, point_map.voxel_m)
     if is_kept.all() or not is_kept.any():
         return point_map
-    return _keep(point_map, is_kept)
+    points, scans = _list_hits(point_map, ~is_kept)
+    return replace(_keep(point_map, is_kept), mover_points=points, mover_scans=scans)
 
 
 def find_movers(points_odom: Float64Array, views: KeyframeViews, voxel_m: float) -> BoolArray:
@@ -91,6 +94,14 @@ def _count(points_odom: Float64Array, views: KeyframeViews) -> tuple[Int64Array,
     for own in np.split(order, np.flatnonzero(np.diff(blocks[order])) + 1):
         n_through[own], n_hit[own] = count_through_and_hit(points_odom[own], views)
     return n_through, n_hit
+
+
+def _list_hits(point_map: PointMap, is_chosen: BoolArray) -> tuple[Float32Array, Int32Array]:
+    """Return (D, 3) chosen ones of the (N,) points, each once for every scan that hit it, and (D,) that scan."""
+    returns = np.flatnonzero(is_chosen[point_map.return_points])
+    hits = point_map.scans_of(returns) * np.int64(len(is_chosen)) + point_map.return_points[returns]
+    scans, points = np.divmod(np.unique(hits), len(is_chosen))
+    return point_map.points[points].astype(np.float32), scans.astype(np.int32)
 
 
 def _keep(point_map: PointMap, is_kept: BoolArray) -> PointMap:

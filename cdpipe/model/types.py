@@ -162,6 +162,9 @@ class PointMap:
             corner; None if not stored.
         views: Range images of the keyframes; None if not stored.
         recorded_T_sensor: (S, 4, 4) recorded pose of every scan, where `odom_T_sensor` was made consistent; else None.
+        mover_points: (D, 3) float32 points that were left out because they moved, one row for each scan that hit one,
+            in scan order; session odom frame, metres. None if there were none.
+        mover_scans: (D,) int32 that scan.
     """
 
     points: Float64Array
@@ -176,11 +179,15 @@ class PointMap:
     return_offsets: UInt8Array | None = None
     views: KeyframeViews | None = None
     recorded_T_sensor: Float64Array | None = None
+    mover_points: Float32Array | None = None
+    mover_scans: Int32Array | None = None
 
     def __post_init__(self) -> None:
         n, m = len(self.points), len(self.return_points)
+        n_dropped = 0 if self.mover_points is None else len(self.mover_points)
         require_shapes(self, points=(None, 3), seen_from=(n, 3), nearest_m=(n,), keyframe_scans=(None,))
         require_shapes(self, return_points=(m,), return_pixels=(m,), return_offsets=(m, 3))
+        require_shapes(self, mover_points=(n_dropped, 3), mover_scans=(n_dropped,))
         require_shapes(self, scan_offsets=(len(self.odom_T_sensor) + 1,))
         require_poses("odom_T_sensor", self.odom_T_sensor)
         if self.recorded_T_sensor is not None:

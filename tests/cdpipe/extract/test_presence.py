@@ -106,6 +106,25 @@ def test_a_crate_that_a_third_of_the_scans_saw_through_is_no_change(session: str
         assert bool(both_ways(session, (passing, passing.mapped()), scanned((), 1))) == is_change, seen
 
 
+@pytest.mark.parametrize("session", ["before", "after"])
+def test_what_lies_beside_a_mover_in_the_same_scans_and_is_seen_through_is_no_change(session: str) -> None:
+    empty = scanned((), 1)
+    leaves, stands = (Passing(range(n), ALONG) for n in (7, 9))
+    maps = [(each, each.mapped()) for each in (leaves, stands)]
+    for (scans, point_map), y_m, moved, is_change in (
+        (maps[0], 1.3, range(9), False),
+        (maps[0], -1.3, range(9), True),
+        (maps[0], 1.3, (2,), True),
+        (maps[0], 1.3, (), True),
+        (maps[1], 1.3, range(9), True),  # as in dust, which maps drop
+    ):
+        hits = np.repeat(np.array(moved, dtype=np.int32), 9)
+        points = np.column_stack([np.tile(np.linspace(1.0, 2.0, 9), len(moved)), *np.tile([[y_m], [0.4]], len(hits))])
+        here = scans, replace(point_map, mover_points=points.astype(np.float32), mover_scans=hits)
+        assert bool(both_ways(session, here, empty)) == is_change, (scans, y_m, moved)
+        assert both_ways(session, here, empty, KEPT)
+
+
 class Plume(RoomScans):
     """A room in which few of the rays that meet a crate return from it."""
 

@@ -82,6 +82,19 @@ def test_a_column_that_moves_is_dropped_and_the_wall_stays() -> None:
     assert np.array_equal(walls[1], walls[0])
 
 
+def test_a_map_tells_what_was_dropped_of_which_scan() -> None:
+    kept = mapped(WALKS)
+    left = drop_movers(kept)
+    assert left.mover_points is not None and left.mover_scans is not None
+    assert (np.diff(left.mover_scans) >= 0).all()
+    # the column of each scan, and nothing else
+    for scan, distance_m in WALKS.items():
+        points = left.mover_points[left.mover_scans == scan]
+        assert len(points) > 10 and np.abs(np.linalg.norm(points[:, :2], axis=1) - distance_m).max() < 0.5, scan
+    hits = {(tuple(point), scan) for point, scan in zip(left.mover_points.tolist(), left.mover_scans, strict=True)}
+    assert len(hits) == len(left.mover_scans)
+
+
 def test_a_map_without_movers_is_the_same_map() -> None:
     for usual in (None, 3.0):
         kept = mapped({}, usual)
