@@ -80,9 +80,18 @@ def _interrupt_or_wait(number: int, frame: FrameType | None) -> None:
     if not _is_importing(frame):
         _raised.append(number)
         signal.default_int_handler(number, frame)
-    again = Timer(_AGAIN_S, signal.raise_signal, (number,))
+    again = Timer(_AGAIN_S, _press_again, (number,))
     again.daemon = True
     again.start()
+
+
+def _press_again(number: int) -> None:
+    """Send a signal to the main thread, so that what it waits for ends; not to the thread that calls this."""
+    to = main_thread().ident
+    if to is not None and hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(to, number)
+    else:  # Windows
+        signal.raise_signal(number)
 
 
 def _is_importing(frame: FrameType | None) -> bool:
