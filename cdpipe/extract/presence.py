@@ -45,8 +45,8 @@ _GONE, _GONE_WAY_M, _HIT_SHARE = 1.0, 60.0, 0.05
 _FARTHEST_M = 60.0
 # A part of a mover: most of its returns lie this near to another part that the same scan hit. Of what maps dropped,
 # which may be dust, it is a part if keyframes within `REACH_M` of way also saw through it so many times as often as
-# they hit it: 0.05 times at most for changed objects of 18 validation pairs of `dynamic/*`, `dust/haul`, `dust/narrow`,
-# over 0.24 times for nearly all parts of machines; of these 0.81 or more lies beside what was dropped.
+# they hit it. In five validation pairs of `dynamic/wide`, `dust/haul` and `dust/narrow` 0.05 times at most for changed
+# objects, over 0.24 times for nearly all parts of machines; of these 0.81 or more lies beside what was dropped.
 _BESIDE_M, _MOST, _PART = 1.0, 0.5, 0.12
 
 
