@@ -283,7 +283,7 @@ def _describe_mistake(model: type[BaseModel], document: Document, error: Any) ->
 
 
 def _near_key(model: type[BaseModel], key: Key, where: str) -> str:
-    """Suggest a key for an unknown one: the same name in a group where the group is missing, else the closest name.
+    """Suggest a key for an unknown one: the same name in a group where the group is missing, the closest name, or all.
 
     A file names its group on a line of its own; an option needs the group in the suggestion.
     """
@@ -296,7 +296,8 @@ def _near_key(model: type[BaseModel], key: Key, where: str) -> str:
     if len(key) == 1 and grouped:
         return f"; did you mean {' or '.join(grouped)}?"
     group = "".join(f"{part}." for part in key[:-1]) if where == "--set" else ""
-    return suggest(last, _fields_at(model, key[:-1]), group)
+    known = list(dict.fromkeys(_fields_at(model, key[:-1])))
+    return suggest(last, known, group) or (f"; known are {', '.join(known)}" if known else "")
 
 
 def _brief(value: Any) -> str:
