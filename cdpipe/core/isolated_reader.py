@@ -93,7 +93,7 @@ class IsolatedReader:
             RuntimeError: The function raised another exception; the text is its traceback.
         """
         process, self._process = self._process or _Process(), None
-        budget_s = CPU_S + self._path.stat().st_size // _BYTES_PER_CPU_S
+        budget_s = CPU_S + size_of(self._path) // _BYTES_PER_CPU_S
         try:
             process.send({"module": self._module, "function": function, "arguments": arguments, "cpu_s": budget_s})
             while (message := process.receive(_WAIT_FACTOR * budget_s)) is not None:
@@ -119,6 +119,12 @@ class _ArrayHeader:
     name: str
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
+
+
+def size_of(path: Path) -> int:
+    """Return the bytes of a file, or of all files in a folder, as a ROS 2 bag is."""
+    files = (each for each in path.rglob("*") if each.is_file()) if path.is_dir() else (path,)
+    return sum(each.stat().st_size for each in files)
 
 
 def _command() -> list[str]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+import warnings
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cdpipe.core.errors import InputError
+from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.io.foreign.opening import HowToRead, folder_of_options, open_recording
 from cdpipe.io.foreign.scans import Repeats
@@ -20,7 +22,10 @@ from cdpipe.io.tum import require_unit_poses
 from cdpipe.mapping.deskew import deskew
 from cdpipe.model.types import PosedScan, ScanSource
 
-__all__ = ["RECORDING_SUFFIXES", "HowToRead", "RecordedScans", "open_session"]
+if TYPE_CHECKING:
+    from cdpipe.io.ouster.recording import Imported
+
+__all__ = ["RECORDING_SUFFIXES", "HowToRead", "RecordedScans", "import_ouster", "open_session"]
 
 
 def open_session(path: str | Path, how: HowToRead | None = None, report: Progress = report_nothing) -> ScanSource:
@@ -49,20 +54,33 @@ def open_session(path: str | Path, how: HowToRead | None = None, report: Progres
     return source
 
 
-def _open_ouster(path: Path, how: HowToRead, report: Progress) -> RecordedScans:
-    """Convert an OSF or a PCAP to a session in a temporary folder, and open that."""
+def import_ouster(path: Path, out: Path, how: HowToRead, report: Progress = report_nothing) -> Imported:
+    """Convert an OSF or a PCAP to a session folder, read as `how` says.
+
+    Raises:
+        InputError: As `cdpipe.io.ouster.recording.import_recording`.
+    """
     from cdpipe.io.ouster.recording import import_recording  # noqa: PLC0415 - it needs the module of this function
 
+    if not how.deskew:
+        told = "its points are in the frames of their columns, and are deskewed in spite of --no-deskew"
+        warnings.warn(f"{path}: {told}", InputWarning, stacklevel=2)
+    return import_recording(
+        path,
+        out,
+        metadata=how.metadata,
+        trajectory=how.trajectory,
+        odometry=how.odometry,
+        origin_m=how.origin_m,
+        on_progress=report,
+    )
+
+
+def _open_ouster(path: Path, how: HowToRead, report: Progress) -> RecordedScans:
+    """Convert an OSF or a PCAP to a session in a temporary folder, and open that."""
     folder = Path(tempfile.mkdtemp(prefix="tunnelcd-read-"))
     try:
-        import_recording(
-            path,
-            folder / path.stem,
-            metadata=how.metadata,
-            trajectory=how.trajectory,
-            odometry=how.odometry,
-            on_progress=report,
-        )
+        import_ouster(path, folder / path.stem, how, report)
         source = RecordedScans(read_session(folder / path.stem))
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)

@@ -15,7 +15,7 @@ import numpy as np
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array, invert, transform, travelled_m
 from cdpipe.core.geometry.grid_index import column_keys
-from cdpipe.core.geometry.voxel import UniqueCells, cell_corners, cell_keys, require_reachable
+from cdpipe.core.geometry.voxel import FINEST_CELL_M, UniqueCells, cell_corners, cell_keys, require_reachable
 from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.core.spooled import SpooledArray
 from cdpipe.mapping.airborne import ClearScans
@@ -194,4 +194,6 @@ def _clip_to_cells(points: Float64Array, keys: Int64Array, voxel_m: float) -> Fl
 
 def _require_reachable(source: ScanSource, config: MapConfig) -> None:
     farthest_m = float(np.abs(source.odom_T_sensor[:, :3, 3]).max(initial=0.0)) + config.max_range_m
-    require_reachable(source.name, farthest_m, config.voxel_m, "map.voxel_m = ")
+    if config.voxel_m < FINEST_CELL_M:
+        require_reachable(source.name, farthest_m, config.voxel_m, "map.voxel_m = ")
+    require_reachable(source.name, farthest_m, FINEST_CELL_M)

@@ -136,12 +136,9 @@ def open_inputs(paths: Sequence[Path], hows: Sequence[HowToRead], progress: RunP
     Raises:
         InputError: One cannot be read, or options are given for sessions alone.
     """
-    from cdpipe.io.foreign import guess_format
     from cdpipe.io.readers import open_session
 
-    for path, how in zip(paths, hows, strict=True):
-        if how.format is None:  # a long reading does not end at a wrong second name
-            guess_format(path)
+    guess_formats(paths, hows)  # a long reading does not end at a wrong second name
     opened: list[Path | ScanSource] = []
     for path, checked in zip(paths, _check_sessions(paths, hows), strict=True):
         source = path if checked is None else open_session(path, checked, progress.stage)
@@ -149,6 +146,26 @@ def open_inputs(paths: Sequence[Path], hows: Sequence[HowToRead], progress: RunP
         if getattr(source, "is_temporary", False):
             progress.note(f"{path} was read into a temporary folder: `tunnelcd convert {path} FOLDER` keeps it")
     return opened
+
+
+def guess_formats(paths: Sequence[Path], hows: Sequence[HowToRead]) -> list[str]:
+    """Return the format of each recording.
+
+    Raises:
+        InputError: One has none, or an option is given that none of them has a use for.
+    """
+    from cdpipe.core.errors import InputError
+    from cdpipe.io.foreign import guess_format
+    from cdpipe.io.foreign.sniff import OUSTER
+
+    names = [how.format or guess_format(path) for path, how in zip(paths, hows, strict=True)]
+    if "bag" not in names and any(how.topics for how in hows):
+        raise InputError(f"--topic: {paths[0]} is no bag: leave it out")
+    for path, how, name in zip(paths, hows, names, strict=True):
+        if how.metadata is not None and name not in OUSTER:
+            more = f", or give {NONE} for it" if len(paths) > 1 else ""
+            raise InputError(f"{path}: --metadata is the sensor of a .pcap: leave it out{more}")
+    return names
 
 
 def open_sources(*inputs: Path | ScanSource) -> list[ScanSource]:

@@ -13,8 +13,7 @@ from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.io.foreign import HowToRead, guess_format
 from cdpipe.io.foreign.sniff import OUSTER
 from cdpipe.io.known_merge import read_known_merge
-from cdpipe.io.ouster.recording import import_recording
-from cdpipe.io.readers import RecordedScans, open_session
+from cdpipe.io.readers import RecordedScans, import_ouster, open_session
 from cdpipe.io.session import Session, read_session
 from cdpipe.model.config import load_config
 from cdpipe.pipeline import Hooks, detect_merge, map_pair
@@ -99,14 +98,7 @@ def _open(path: Path, how: HowToRead, folder: Path, on_progress: Progress) -> Se
         return as_session(open_session(path, how, on_progress))
     folder.mkdir()
     session = folder / path.name
-    import_recording(
-        path,
-        session,
-        metadata=how.metadata,
-        trajectory=how.trajectory,
-        odometry=how.odometry,
-        on_progress=on_progress,
-    )
+    import_ouster(path, session, how, on_progress)
     return read_session(session)
 
 

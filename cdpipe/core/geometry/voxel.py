@@ -7,6 +7,8 @@ import numpy as np
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry.arrays import Float32Array, Float64Array, Int64Array
 
+FINEST_CELL_M = 0.05
+"""Edge of the finest cells of the extraction and of the surface, which decides how far away places may be."""
 _BITS = 21
 _HALF = 1 << (_BITS - 1)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +20,10 @@ from cdpipe.io.foreign.clouds import Cloud, check_cloud
 from cdpipe.io.foreign.trajectory import Trajectory
 from cdpipe.io.tum import require_unit_poses
 
-# Frames in which a robot keeps its way, the smooth one first.
+# Frames in which a robot keeps its way, the smooth one first; that of LOAM and its kin moves with no sensor either.
 _FIXED = ("odom", "map", "world")
+_NO_SENSOR = (*_FIXED, "camera_init")
+_STANDING = 1e-6  # change of a pose entry, metres or radians, that is none
 _LONGEST_CHAIN = 64
 _LISTED = 8
 _MOST_WAITING = 64  # clouds in memory while they are sorted: 200 MB of 130,000 points each
@@ -38,6 +40,10 @@ class _Edge:
     def at(self, time_s: Float64Array) -> Float64Array:
         motion = Trajectory("", self.poses, self.time_s).motion()
         return self.poses[:1].repeat(len(time_s), axis=0) if motion is None else motion.poses(time_s)
+
+    @property
+    def is_moving(self) -> bool:
+        return bool(np.ptp(self.poses, axis=0).max() > _STANDING)  # a publisher of static frames may repeat them
 
 
 class BagScans:
@@ -80,6 +86,9 @@ class BagScans:
         stamps = stamps[self._numbers]
         self.stamps_s: Float64Array | None = stamps / 1e9
         self.lacks = f"no poses of the sensor in it (it holds {self._listed()})"
+        if is_posed and self._frame in _NO_SENSOR:
+            told = f"its frame is {self._frame}, which does not move with the sensor: where the clouds are registered"
+            warnings.warn(f"{path}: {self._topic}: {told} already, name the raw ones", InputWarning, stacklevel=2)
         if not is_posed:
             self.own = self._find_poses(topics)
             if self.own is not None:
@@ -181,22 +190,35 @@ class BagScans:
         self.stamps_s = stamps_s[is_inside]
 
     def _find_poses(self, topics: Sequence[str]) -> Trajectory | None:
-        """Return poses by a named topic; else by tf below a fixed frame, Odometry, PoseStamped, or other tf."""
+        """Return poses by a named topic; else by tf that moves below a fixed frame, Odometry, PoseStamped, other tf."""
         edges = self._read_edges([name for name, kind, _ in self._topics if kind == TRANSFORMS])
         named = [(name, kind) for name, kind, _ in self._topics if name in topics and kind in (ODOMETRY, POSE)]
         chain = _chain(edges, self._frame)
-        is_moving = any(len(edge.time_s) > 1 for edge in chain)
+        is_moving = any(edge.is_moving for edge in chain)
         if not named and is_moving and chain[0].parent in _FIXED:
             return _compose(f"tf of {self._path}", chain)
         for kind in (ODOMETRY, POSE):
             found = [name for name, its_kind in named if its_kind == kind]
             if found or (not named and any(its_kind == kind for _, its_kind, _ in self._topics)):
                 return self._read_poses(self._choose(kind, topics, kind.rsplit("/", 1)[-1]), edges)
-        return _compose(f"tf of {self._path}", chain) if is_moving else None
+        is_standing = not is_moving and any(len(edge.time_s) > 1 for edge in chain) and chain[0].parent in _FIXED
+        if is_standing:
+            told = f"by its tf {visible(self._frame)} stands in {visible(chain[0].parent)}, and so does the sensor"
+            warnings.warn(f"{self._path}: {told}", InputWarning, stacklevel=2)
+        return _compose(f"tf of {self._path}", chain) if is_moving or is_standing else None
 
     def _read_poses(self, topic: str, edges: dict[str, _Edge]) -> Trajectory | None:
-        """Return the poses of one topic, with the fixed mounting of the sensor on what they are poses of."""
+        """Return the poses of one topic, with the fixed mounting of the sensor on what they are poses of.
+
+        Clouds in the frame that the poses lie in are registered already, as those of LOAM and its kin are.
+        """
         for child, edge in self._read_edges([topic]).items():
+            if self._frame and self._frame == edge.parent:
+                told = f"its clouds are in {visible(self._frame)}, the frame of the poses of {topic}"
+                told += ": they are taken as registered, and moved back"
+                warnings.warn(f"{self._path}: {self._topic}: {told}", InputWarning, stacklevel=2)
+                found = _compose(f"{topic} of {self._path}", [edge])
+                return found and replace(found, holds_clouds=True)
             mounting = [] if child in ("", self._frame) else _chain(edges, self._frame, child)
             if child not in ("", self._frame) and not mounting:
                 told = (
@@ -246,9 +268,7 @@ def _chain(edges: dict[str, _Edge], frame: str, top: str = "") -> list[_Edge]:
 
 def _compose(where: str, chain: Sequence[_Edge]) -> Trajectory | None:
     """Return the poses along a chain of edges, at the times of that with the most; None if they share no time."""
-    moving = [edge.time_s for edge in chain if len(edge.time_s) > 1]
-    if not moving:
-        return Trajectory(where, chain[0].at(chain[0].time_s), chain[0].time_s)
+    moving = [edge.time_s for edge in chain if len(edge.time_s) > 1] or [chain[0].time_s]
     start_s, end_s = max(times[0] for times in moving), min(times[-1] for times in moving)
     time_s = max(moving, key=len)
     time_s = time_s[(time_s >= start_s) & (time_s <= end_s)]

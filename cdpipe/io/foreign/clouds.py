@@ -16,7 +16,7 @@ from cdpipe.core.geometry import Float32Array, Float64Array
 from cdpipe.io.foreign.trajectory import Trajectory
 
 # Longest and shortest sweep of a scan, which tell the unit of the times of its points.
-_SWEEP_S = (0.004, 1.5)
+SWEEP_S = (0.004, 1.5)
 TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "timeoffset", "point_time", "gps_time")
 """Names, in lower case, under which formats keep the time of each point."""
 INTENSITY_FIELDS = ("intensity", "reflectivity", "remission", "scalar_intensity", "i")
@@ -130,21 +130,19 @@ def field_of(names: Iterable[str], usual: Sequence[str]) -> str | None:
 def point_times(times: npt.NDArray[np.number] | None, stamp_s: float) -> Float64Array | None:
     """Return the time of each point after the stamp of its scan, seconds; None unless they span one sweep.
 
-    The unit follows from the span, s to ns. Times near the stamp are of its clock; times that begin near zero count
-    from the stamp; others are of another clock, and their first one is the stamp's.
+    The unit follows from the span, s to ns. Times that begin near the stamp are of its clock; those that begin near
+    zero count from the stamp; others are of another clock, and their first one is the stamp's.
     """
     if times is None or len(times) < 2 or not np.isfinite(times).all():
         return None
     first = times.min()
     span = float(times.max()) - float(first)
-    scale = next((unit for unit in (1.0, 1e-3, 1e-6, 1e-9) if _SWEEP_S[0] <= span * unit <= _SWEEP_S[1]), None)
+    scale = next((unit for unit in (1.0, 1e-3, 1e-6, 1e-9) if SWEEP_S[0] <= span * unit <= SWEEP_S[1]), None)
     if scale is None:
         return None
     since_s: Float64Array = (times - first).astype(np.float64) * scale
-    start_s = float(first) * scale
-    if abs(start_s) <= _SWEEP_S[1]:
-        return since_s + start_s
-    return since_s + (start_s - stamp_s if abs(start_s - stamp_s) <= _SWEEP_S[1] else 0.0)
+    start_s = min(float(first) * scale, float(first) * scale - stamp_s, key=abs)
+    return since_s + (start_s if abs(start_s) <= SWEEP_S[1] else 0.0)
 
 
 def stamps_of_names(files: list[Path]) -> Float64Array | None:

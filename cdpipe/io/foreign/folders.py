@@ -46,12 +46,14 @@ def open_folder(folder: Path, name: str, has_poses: bool) -> Clouds:
     own = None if has_poses else _find_poses(folder, files[0].parent, name)
     clouds = CloudFiles(folder, files, cloud_reader(name, folder), own, _find_stamps(folder, files))
     clouds.lacks = f"expected exactly one trajectory (*.txt, *.tum or *.csv, lines {TUM_LINE}), found none"
-    if own is None and not has_poses and name == "pcd" and files[0].parent != folder:
+    if own is None and not has_poses and name == "pcd" and files[0].parent == folder / "pcd":
         return _with_viewpoints(clouds, folder, files)
     return clouds
 
 
 def _require_padded(folder: Path, files: list[Path]) -> None:
+    if stamps_of_names(files) is not None:  # 1700000000.15 before 1700000000.2
+        return
     by_number = sorted(
         files, key=lambda file: [int(part) if part.isdigit() else part for part in _NUMBERS.split(file.name)]
     )

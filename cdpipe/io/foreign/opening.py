@@ -23,7 +23,7 @@ from cdpipe.core.progress import Progress
 from cdpipe.io.foreign.clouds import Clouds, point_times
 from cdpipe.io.foreign.folders import E57Scans, open_folder
 from cdpipe.io.foreign.points_files import cloud_reader
-from cdpipe.io.foreign.scans import PosedClouds
+from cdpipe.io.foreign.scans import PosedClouds, in_sensor_frames
 from cdpipe.io.foreign.sniff import FORMATS, guess_format, require_format_name
 from cdpipe.io.foreign.trajectory import Trajectory, poses_at, read_poses, require_times_of_scans
 from cdpipe.io.foreign.whole_map import MapStations
@@ -82,9 +82,16 @@ class _Posed(PosedClouds):
     """Scans with poses, and where those came from."""
 
     def __init__(
-        self, clouds: Clouds, poses: Float64Array, stamps_s: Float64Array, motion: Motion | None, poses_from: str
+        self,
+        clouds: Clouds,
+        poses: Float64Array,
+        stamps_s: Float64Array,
+        motion: Motion | None,
+        poses_from: str,
+        *,
+        deskew: bool,
     ) -> None:
-        super().__init__(clouds, poses, stamps_s, motion)
+        super().__init__(clouds, poses, stamps_s, motion, deskew=deskew)
         self.clouds, self.poses_from = clouds, poses_from
 
 
@@ -214,8 +221,10 @@ def _pose(clouds: Clouds, how: HowToRead, report: Progress) -> _Posed:
             stamps_s = trajectory.time_s
         elif stamps_s is not None:
             motion = Trajectory("", poses, stamps_s).motion()
+    if trajectory.holds_clouds:
+        clouds = in_sensor_frames(clouds, Trajectory("", poses).less([-metres for metres in how.origin_m]).poses)
     times_s = stamps_s if stamps_s is not None else _nominal_s(n_scans)
-    return _Posed(clouds, poses, times_s, motion if how.deskew else None, trajectory.where)
+    return _Posed(clouds, poses, times_s, motion, trajectory.where, deskew=how.deskew)
 
 
 def _nominal_s(n_scans: int) -> Float64Array:
@@ -249,5 +258,5 @@ def _estimate(clouds: Clouds, how: HowToRead, report: Progress) -> _Posed:
         poses = estimate_cloud_motion(frames(), stamps_s, odometry)
     except InputError as error:
         raise InputError(f"{clouds.name}: {error}: give the poses with --trajectory") from error
-    motion = Trajectory("", poses, stamps_s).motion() if how.deskew else None
-    return _Posed(clouds, poses, stamps_s, motion, odometry)
+    motion = Trajectory("", poses, stamps_s).motion()
+    return _Posed(clouds, poses, stamps_s, motion, odometry, deskew=how.deskew)

@@ -156,13 +156,19 @@ def read_e57_heads(path: str) -> Iterator[Message]:
 
 
 def read_e57(path: str, index: int) -> Iterator[Message]:
-    """Yield the points of one scan of an E57 file, in the scanner's frame."""
+    """Yield the points of one scan of an E57 file, in the scanner's frame, and their intensity where there is one."""
     import pye57
+    from pye57.utils import convert_spherical_to_cartesian
 
     with _reads(path, "an E57 file"):
-        data = pye57.E57(path).read_scan(index, ignore_missing_fields=True, transform=False)
-        points = np.column_stack([data[f"cartesian{axis}"] for axis in "XYZ"])
-    yield {}, {"points": points}
+        data = pye57.E57(path).read_scan(index, intensity=True, ignore_missing_fields=True, transform=False)
+        if "sphericalRange" in data:
+            turned = np.column_stack([data[f"spherical{part}"] for part in ("Range", "Azimuth", "Elevation")])
+            points = convert_spherical_to_cartesian(turned)
+        else:
+            points = np.column_stack([data[f"cartesian{axis}"] for axis in "XYZ"])
+    shone = {"intensity": data["intensity"]} if "intensity" in data else {}
+    yield {}, {"points": points, **shone}
 
 
 @contextmanager

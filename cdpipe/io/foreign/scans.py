@@ -15,13 +15,14 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.geometry import Float64Array, Int64Array, invert
 from cdpipe.core.geometry.motion import Motion
-from cdpipe.io.foreign.clouds import Cloud, Clouds, point_times
+from cdpipe.io.foreign.clouds import SWEEP_S, Cloud, Clouds, point_times
 from cdpipe.model.types import PosedScan
 
 # Largest change of a pose entry, metres or radians, that odometry reports for a sensor at rest.
 _STANDING = 0.1
 # Points are deskewed in steps of this time: 0.3 mm at 3 m/s.
 _STEP_S = 1e-4
+_NO_SWEEP = f"they span no sweep, {SWEEP_S[0]} to {SWEEP_S[1]} s"
 
 
 class PosedClouds:
@@ -41,7 +42,13 @@ class PosedClouds:
     is_whole_map = False
 
     def __init__(
-        self, clouds: Clouds, odom_T_sensor: Float64Array, stamps_s: Float64Array, motion: Motion | None
+        self,
+        clouds: Clouds,
+        odom_T_sensor: Float64Array,
+        stamps_s: Float64Array,
+        motion: Motion | None,
+        *,
+        deskew: bool = False,
     ) -> None:
         """Keep what to read.
 
@@ -49,11 +56,12 @@ class PosedClouds:
             clouds: The scans.
             odom_T_sensor: (S, 4, 4) pose of each.
             stamps_s: (S,) time of each, seconds.
-            motion: The movement between the scans, which deskews points that have times; None: points stay as they are.
+            motion: The movement between the scans; None where there is none.
+            deskew: Whether the motion deskews points that have times.
         """
         self.name = clouds.name
         self.odom_T_sensor = odom_T_sensor
-        self._clouds, self.stamps_s, self._motion = clouds, stamps_s, motion
+        self._clouds, self.stamps_s, self._motion, self._deskew = clouds, stamps_s, motion, deskew
         self._stamps_ns: Int64Array = np.round((stamps_s - stamps_s[0]) * 1e9).astype(np.int64)
 
     def scan(self, index: int) -> PosedScan:
@@ -65,24 +73,30 @@ class PosedClouds:
         return self._make(index, self._clouds.read(index))[0]
 
     def scans(self) -> Iterator[PosedScan]:
-        """Read all scans in order; an `InputWarning` says how many missing returns were dropped.
+        """Read all scans in order; an `InputWarning` says how many missing returns were dropped, or scans not deskewed.
 
         Raises:
             InputError: As `scan`; or two scans are the same.
         """
         repeats = Repeats()
-        n_missing, n_points = 0, 0
+        n_missing, n_points, n_skewed = 0, 0, 0
         for index, cloud in enumerate(self._clouds.read_all()):
             scan, n_dropped = self._make(index, cloud)
             n_missing, n_points = n_missing + n_dropped, n_points + n_dropped + len(scan.pixels)
+            n_skewed += self._deskew and _has_times(cloud) and not np.ptp(scan.stamps_ns)
             stamp_ns = int(self._stamps_ns[index])
             where = self._clouds.where(index)
             name = where.rsplit("/", 1)[-1]
-            repeats.require_new(where, name, scan.points_sensor, self.odom_T_sensor[index], stamp_ns)
+            if not self.is_whole_map:  # its stations, which nobody recorded, may lie on a regular grid
+                repeats.require_new(where, name, scan.points_sensor, self.odom_T_sensor[index], stamp_ns)
             yield scan
         if n_missing:
             told = f"{n_missing} of {n_points} points are (0, 0, 0) or NaN: taken for missing returns and left out"
             warnings.warn(f"{self.name}: {told}", InputWarning, stacklevel=2)
+        if n_skewed:
+            lack = "there are no two poses with times that rise" if self._motion is None else _NO_SWEEP
+            told = f"{n_skewed} of {len(self.odom_T_sensor)} scans are not deskewed, though their points have times"
+            warnings.warn(f"{self.name}: {told}: {lack} (--no-deskew if they are already)", InputWarning, stacklevel=2)
 
     def _make(self, index: int, cloud: Cloud) -> tuple[PosedScan, int]:
         """Return a scan, and the number of its missing returns; organised clouds store them as (0, 0, 0) or NaN."""
@@ -99,7 +113,7 @@ class PosedClouds:
         stamps_ns = np.full(np.count_nonzero(is_return), self._stamps_ns[index])
         kept = points[is_return]
         times = None if cloud.times is None else cloud.times[is_return]
-        offset_s = point_times(times, float(self.stamps_s[index])) if self._motion is not None else None
+        offset_s = point_times(times, float(self.stamps_s[index])) if self._deskew else None
         if offset_s is not None and self._motion is not None:
             kept = deskew_points(kept, offset_s, float(self.stamps_s[index]), self._motion)
             stamps_ns = stamps_ns + np.round(offset_s * 1e9).astype(np.int64)
@@ -107,6 +121,11 @@ class PosedClouds:
         shone = None if cloud.intensity is None else cloud.intensity[is_return]
         scan = PosedScan(index, kept, self.odom_T_sensor[index], stamps_ns, pixels, intensity=shone)
         return scan, len(points) - len(pixels)
+
+
+def _has_times(cloud: Cloud) -> bool:
+    """Return whether the points of a cloud have times that differ."""
+    return cloud.times is not None and len(cloud.times) > 1 and bool((cloud.times != cloud.times[0]).any())
 
 
 class Repeats:

@@ -24,6 +24,9 @@ _NOMINAL_S = 0.1  # between scans, where there is one scan only
 # Poses farther apart than this say nothing about the scans between them, unless scans are as rare.
 _LONGEST_GAP_S = 1.0
 _SECONDS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # from this median on, stamps are ns, us, ms
+# What may end the name of a CSV's column, `yaw_deg` or `time [ms]`: units of angles, and of times but for seconds.
+_ANGLE_UNITS = ("deg", "degrees", "rad", "radians")
+_TIME_UNITS_S = {"ms": 1e-3, "msec": 1e-3, "us": 1e-6, "usec": 1e-6, "ns": 1e-9, "nsec": 1e-9}
 _NAMES = {
     "time": ("t", "time", "stamp", "timestamp", "s"),
     "sec": ("sec", "secs", "seconds"), "nsec": ("nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds", "ns"),
@@ -50,12 +53,14 @@ class Trajectory:
         poses: (N, 4, 4) `odom_T_sensor`.
         time_s: (N,) times, seconds of the clock of the scans; None where the file has none.
         is_tum: Whether the file is a TUM file.
+        holds_clouds: Whether the points of the scans are in the frame of the poses, registered already.
     """
 
     where: str
     poses: Float64Array
     time_s: Float64Array | None = None
     is_tum: bool = False
+    holds_clouds: bool = False
 
     def less(self, origin_m: Sequence[float]) -> Trajectory:
         """Return the poses with the origin (3,) at these coordinates."""
@@ -214,7 +219,8 @@ def _columns(names: Sequence[str]) -> dict[str, int]:
     for index, name in enumerate(names):
         text = re.sub(r"[\[(].*?[\])]", "", name).strip().lower()
         tokens = [token for token in re.split(r"[^a-z0-9]+", text) if token]
-        tokens = tokens[:-1] if len(tokens) > 1 and tokens[-1] in ("deg", "degrees", "rad", "radians") else tokens
+        is_unit = len(tokens) > 1 and tokens[-1] in (*_ANGLE_UNITS, *_TIME_UNITS_S)
+        tokens = tokens[:-1] if is_unit and tokens[-1] not in _NAMES["nsec"] else tokens
         if not tokens:
             continue
         # `pose.orientation.x`, `q_RS_x`: the last word is the axis, a word before says of what
@@ -249,7 +255,8 @@ def _read_csv(path: Path, names: list[str], lines: list[tuple[int, str]]) -> Tra
         rotations = Rotation.from_euler("xyz", rows[:, 3:6], degrees=is_degrees)
         _poses(path, np.column_stack([rows[:, :3], rotations.as_quat()]), numbers)  # which refuses what is no pose
         poses = make_pose(rotations.as_matrix(), rows[:, :3])
-    return Trajectory(str(path), poses, _rising(path, _add_clocks(rows[:, len(used) :])) if clocks else None)
+    time_s = _add_clocks(rows[:, len(used) :], [names[index] for index in clocks]) if clocks else None
+    return Trajectory(str(path), poses, None if time_s is None else _rising(path, time_s))
 
 
 def _clocks(columns: dict[str, int]) -> list[int]:
@@ -259,9 +266,12 @@ def _clocks(columns: dict[str, int]) -> list[int]:
     return [columns[name] for name in ("sec", "nsec") if name in columns]
 
 
-def _add_clocks(stamps: Float64Array) -> Float64Array:
+def _add_clocks(stamps: Float64Array, names: Sequence[str]) -> Float64Array:
     """Return the times (N,), seconds, of columns (N, 1), or (N, 2) of seconds and the nanoseconds beyond them."""
     last = stamps[:, -1]
+    unit = re.findall(r"[a-z]+", names[0].lower())[-1]
+    if len(names) == 1 and unit in _TIME_UNITS_S:
+        return last * _TIME_UNITS_S[unit]
     is_rest = stamps.shape[1] == 2 and bool((np.abs(last) < 1e9).all())
     return stamps[:, 0] + 1e-9 * last if is_rest else _seconds(last)  # nanoseconds from 1e9 on are whole stamps
 

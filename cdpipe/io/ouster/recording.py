@@ -12,7 +12,7 @@ Both returns of a beam are kept. A missing column has no returns and an interpol
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -73,6 +73,7 @@ def import_recording(
     metadata: Path | None = None,
     trajectory: Path | None = None,
     odometry: str | None = None,
+    origin_m: Sequence[float] = (0.0, 0.0, 0.0),
     on_progress: Progress | None = None,
 ) -> Imported:
     """Convert an OSF or a PCAP to a session folder; the folder gets its name when it is complete.
@@ -84,6 +85,7 @@ def import_recording(
         trajectory: TUM, KITTI or CSV file with the sensor's poses, which replaces the recording's own. Without times
             it has one pose for each revolution, at its first column.
         odometry: "kiss-icp" or "genz-icp" estimates the poses instead.
+        origin_m: Metres to subtract from the positions of poses that are not estimated, as of a map grid (UTM).
         on_progress: Called with the stage, the number of finished revolutions and their estimated total.
 
     Raises:
@@ -108,7 +110,9 @@ def import_recording(
     }
     chunk_scans = fit_chunk(recording.sensor.height * times.n_returns, recording.sensor.width)
     with SessionWriter(out, recording.sensor, chunk_scans, provenance, times.n_returns) as writer:
-        writer.close(_write(writer, chunk_scans, recording, times, motion, report))
+        odom_T_sensor = _write(writer, chunk_scans, recording, times, motion, report)
+        odom_T_sensor[:, :3, 3] -= origin_m if odometry is None else (0.0, 0.0, 0.0)
+        writer.close(odom_T_sensor)
     sensor = f"{recording.sensor.product}, {recording.sensor.mode}"
     return Imported(len(times.first_ns), poses, sensor, times.n_left_out)
 

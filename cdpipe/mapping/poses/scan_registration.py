@@ -115,6 +115,8 @@ class Target:
 
     def planes(self, points: Float64Array, within_m: float) -> tuple[Int64Array, Float64Array, Float64Array]:
         """Return which of (N, 3) points have a plane, their (M,) signed distances, and the (M, 3) normals."""
+        if not len(self._points):  # small_gicp dies of a search among none
+            return np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3))
         nearest, squared_m2 = self._tree.batch_knn_search(points, 1)
         chosen = np.flatnonzero(squared_m2[:, 0] < within_m**2)
         nearest = nearest[chosen, 0].astype(np.int64)

@@ -18,6 +18,7 @@ from eval.cli.inputs import (
     Origin,
     Topics,
     Trajectories,
+    guess_formats,
     how_to_read,
     open_inputs,
     open_sources,
@@ -68,7 +69,7 @@ def convert(
     BEFORE AFTER ANSWER become one map with scalar fields, .laz or .ply. A scenario becomes a .glb.
     """
     from cdpipe.core.errors import InputError
-    from cdpipe.io.foreign import HowToRead, guess_format
+    from cdpipe.io.foreign import HowToRead
 
     if len(sources) not in (1, _ANSWER):
         raise InputError(f"{len(sources)} inputs: expected one, or BEFORE AFTER ANSWER, and then the output")
@@ -89,7 +90,7 @@ def convert(
         if _is_session(source, hows[0]):
             say(quiet, _export(source, out, to, None, progress, cell_m, with_truth=with_truth))
             return
-        name = hows[0].format or guess_format(source)
+        (name,) = guess_formats([source], hows)
         _refuse_truth(source, with_truth)
         if out.suffix or to is not None:
             say(quiet, _export(source, out, to, hows[0], progress, cell_m, with_truth=False))
@@ -129,7 +130,8 @@ def _is_session(source: Path, how: HowToRead) -> bool:
         raise InputError(f"{source}: a pair of sessions: convert {source / 'before'} and {source / 'after'} one by one")
     if is_session(source) and how != HowToRead():
         given = {"metadata": how.metadata, "trajectory": how.trajectory, "odometry": how.odometry, "format": how.format}
-        name = next((name for name, value in given.items() if value is not None), "topic")
+        given |= {"topic": how.topics or None, "no-deskew": None if how.deskew else True}
+        name = next((name for name, value in given.items() if value is not None), "origin")
         meant = " (the format that is written is --to)" if name == "format" else ""
         raise InputError(f"{source}: a session has its own poses and sensor: leave --{name} out{meant}")
     return is_session(source)
@@ -158,7 +160,7 @@ def _convert_world(
 def _import(source: Path, out: Path, name: str, how: HowToRead, progress: RunProgress) -> str:
     from cdpipe.io.foreign import convert_recording
     from cdpipe.io.foreign.sniff import OUSTER
-    from cdpipe.io.ouster.recording import import_recording
+    from cdpipe.io.readers import import_ouster
     from eval.core.output import made_parents, new_folder
 
     if name not in OUSTER:
@@ -167,14 +169,7 @@ def _import(source: Path, out: Path, name: str, how: HowToRead, progress: RunPro
         told = "1 scan" if n_scans == 1 else f"{n_scans} scans"
         return f"{out}: {told} as PLY, trajectory.tum, poses: {poses}{_too_short(n_scans)}"
     with made_parents(out):
-        imported = import_recording(
-            source,
-            out,
-            metadata=how.metadata,
-            trajectory=how.trajectory,
-            odometry=how.odometry,
-            on_progress=progress.stage,
-        )
+        imported = import_ouster(source, out, how, progress.stage)
     revolutions = "1 revolution" if imported.n_scans == 1 else f"{imported.n_scans} revolutions"
     told = f"{out}: session of {revolutions}, {imported.sensor}, poses: {imported.poses}"
     if imported.n_left_out:

@@ -99,6 +99,18 @@ def test_too_long_is_one_line(
         read(function)
 
 
+def test_a_folder_has_the_time_of_its_files(tmp_path: Path) -> None:
+    (tmp_path / "bag" / "more").mkdir(parents=True)
+    for name in ("a.db3", "more/b.db3"):
+        with (tmp_path / "bag" / name).open("wb") as file:
+            file.truncate(60_000_000)
+    assert (
+        isolated_reader.size_of(tmp_path / "bag")
+        == 2 * isolated_reader.size_of(tmp_path / "bag" / "a.db3")
+        == 120_000_000
+    )
+
+
 def test_a_reader_killed_before_its_answer_is_awaited_took_too_long(
     read: Callable[..., list[isolated_reader.Message]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -164,8 +164,11 @@ class RosMessages:
         more = {"seq": 0} if self.is_first else {}
         return self.types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame, **more)
 
-    def clouds(self, unit_ns: bool = True) -> Iterable[tuple[float, Any]]:
-        """Yield stamps and clouds: x, y, z as float32, padding, and t as Ouster's driver has it (uint32 ns)."""
+    def clouds(self, frame: str = "os_lidar") -> Iterable[tuple[float, Any]]:
+        """Yield stamps and clouds: x, y, z as float32, padding, and t as Ouster's driver has it (uint32 ns).
+
+        In frame "odom" the clouds are registered.
+        """
         dtype = np.dtype({"names": ["x", "y", "z", "t"], "formats": ["<f4", "<f4", "<f4", "<u4"],
                           "offsets": [0, 4, 8, 20], "itemsize": 32})  # fmt: skip
         field = self.types["sensor_msgs/msg/PointField"]
@@ -173,11 +176,13 @@ class RosMessages:
                   (("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("t", 20, 6))]  # fmt: skip
         for stamp_s, (points, offset_s) in zip(self._made.stamps_s, self._made.clouds, strict=True):
             table = np.zeros(len(points), dtype)
-            for axis, values in zip("xyz", points.T, strict=True):
+            poses = odom_T_sensor(stamp_s + offset_s) if frame == "odom" else np.eye(4)[None]
+            moved = (poses[:, :3, :3] @ points[..., None])[..., 0] + poses[:, :3, 3]
+            for axis, values in zip("xyz", moved.T, strict=True):
                 table[axis] = values
             table["t"] = np.round(offset_s * 1e9)
             yield stamp_s, self.types["sensor_msgs/msg/PointCloud2"](
-                header=self._header(stamp_s, "os_lidar"), height=1, width=len(points), fields=fields,
+                header=self._header(stamp_s, frame), height=1, width=len(points), fields=fields,
                 is_bigendian=False, point_step=32, row_step=32 * len(points),
                 data=np.frombuffer(table.tobytes(), np.uint8), is_dense=True,
             )  # fmt: skip
@@ -219,17 +224,19 @@ class RosMessages:
     def all(self, poses: str, cloud_topics: Sequence[str], last_pose_s: float) -> list[tuple[str, str, float, Any]]:
         """Return topic, type, time and message of everything: `poses` is tf, odometry, pose or none.
 
-        With "footprint" there is odometry, and tf moves between two frames of the robot.
+        With "footprint" there is odometry, and tf moves between two frames of the robot; with "standing" tf repeats
+        that the robot stands in the map; with "registered" the clouds lie in the frame of the odometry. "mounting" has
+        no poses, and tf that repeats where the sensor is on the robot.
         """
         made = [
             (topic, "sensor_msgs/msg/PointCloud2", time_s, cloud)
             for topic in cloud_topics
-            for time_s, cloud in self.clouds()
+            for time_s, cloud in self.clouds("odom" if poses == "registered" else "os_lidar")
         ]
         times = np.arange(self._made.stamps_s[0] - 0.1, min(self._made.stamps_s[-1] + 0.25, last_pose_s), 1 / BASE_HZ)
         base = odom_T_sensor(times) @ invert(BASE_T_SENSOR)
         tf, first = "tf2_msgs/msg/TFMessage", float(times[0])
-        if poses in ("tf", "odometry", "footprint"):
+        if poses in ("tf", "odometry", "footprint", "standing"):
             made.append(("/tf_static", tf, first, self.transform(first, "base_link", "os_lidar", BASE_T_SENSOR)))
         for time_s, pose in zip(times.tolist(), base, strict=True):
             if poses == "tf":
@@ -237,10 +244,13 @@ class RosMessages:
                 made.append(
                     ("/tf", tf, time_s, self.transform(time_s, "map", "odom", yaw_pose(0.3, (5.0, time_s, 0.0))))
                 )
-            elif poses in ("odometry", "footprint"):
+            elif poses == "mounting":
+                made.append(("/tf", tf, time_s, self.transform(time_s, "base_link", "os_lidar", BASE_T_SENSOR)))
+            elif poses in ("odometry", "footprint", "standing", "registered"):
                 made.append(("/odom", "nav_msgs/msg/Odometry", time_s, self.odometry(time_s, pose)))
-                if poses == "footprint":
-                    made.append(("/tf", tf, time_s, self.transform(time_s, "base_footprint", "base_link", np.eye(4))))
+                above = {"footprint": "base_footprint", "standing": "map"}.get(poses)
+                if above is not None:
+                    made.append(("/tf", tf, time_s, self.transform(time_s, above, "base_link", np.eye(4))))
             elif poses == "pose":
                 sensor = self.pose(time_s, pose @ BASE_T_SENSOR)
                 made.append(("/slam/pose", "geometry_msgs/msg/PoseStamped", time_s, sensor))

@@ -18,8 +18,11 @@ pytest.importorskip("pypcd4", reason="pip install 'tunnelcd[formats]'")
 pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
 
 from cdpipe.core.errors import InputError, InputWarning
-from cdpipe.core.geometry import transform
+from cdpipe.core.geometry import make_pose, transform
 from cdpipe.io.foreign import HowToRead, convert_recording, folder_of_options, guess_format, read_poses
+from cdpipe.io.foreign.bags import _compose, _Edge
+from cdpipe.io.foreign.clouds import point_times
+from cdpipe.io.foreign.points_files import read_e57
 from cdpipe.io.ply import read_ply
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.session_check import check_session
@@ -88,6 +91,70 @@ def test_e57_has_the_poses_of_its_scanner(tmp_path: Path) -> None:
     assert worst_m(write_e57(tmp_path / "a.e57", STANDING)) < 1e-4
 
 
+def test_an_e57_in_spherical_coordinates_with_intensities(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pye57 = pytest.importorskip("pye57")
+    path = write_e57(tmp_path / "a.e57", STANDING)  # pye57 reads spherical coordinates, and writes none
+
+    def spherical(file: object, index: int, **options: bool) -> dict[str, np.ndarray]:
+        assert options["intensity"]
+        x, y, z = STANDING.clouds[index][0].T
+        range_m = np.sqrt(x * x + y * y + z * z)
+        turned = {"sphericalRange": range_m, "sphericalAzimuth": np.arctan2(y, x)}
+        return {**turned, "sphericalElevation": np.arcsin(z / range_m), "intensity": np.full(len(x), 0.5)}
+
+    monkeypatch.setattr(pye57.E57, "read_scan", spherical)
+    ((_, arrays),) = read_e57(str(path), 2)
+    np.testing.assert_allclose(arrays["points"], STANDING.clouds[2][0], atol=1e-9)
+    assert set(arrays["intensity"]) == {0.5}
+
+
+def test_names_that_are_stamps_need_no_zeros(tmp_path: Path) -> None:
+    folder = write_pcds(tmp_path / "run", STANDING)
+    for index, share in enumerate(("05", "15", "2", "3", "45", "5")):
+        (folder / f"{index:06d}.pcd").rename(folder / f"{START_NS // 10**9}.{share}.pcd")
+    poses = write_trajectory(tmp_path / "t.tum", np.array([0.05, 0.15, 0.2, 0.3, 0.45, 0.5]))
+    assert len(list(open_session(folder, HowToRead(trajectory=poses, deskew=False)).scans())) == 6
+    for index in (2, 15):
+        shutil.copy(folder / f"{START_NS // 10**9}.2.pcd", tmp_path / f"{index}.pcd")
+    assert "numbered without leading zeros" in said(tmp_path, HowToRead(trajectory=poses, format="pcd"))
+
+
+def test_viewpoints_are_poses_in_the_sub_folder_pcd_alone(tmp_path: Path) -> None:
+    for name in ("pcd", "scans"):
+        folder = write_pcds(tmp_path / name / name, STANDING, "ascii", with_time=False)
+        for file, stamp_s in zip(sorted(folder.glob("*.pcd")), STANDING.stamps_s, strict=True):
+            file.write_text(file.read_text().replace("VIEWPOINT 0.0 0.0 0.0", f"VIEWPOINT {stamp_s} 0.0 0.0"))
+    assert len(list(open_session(tmp_path / "pcd").scans())) == 6
+    assert "expected exactly one trajectory" in said(tmp_path / "scans")
+
+
+def test_times_of_points_count_from_the_nearer_of_stamp_and_zero() -> None:
+    sweep_s = np.linspace(0.0, 0.1, 5)
+    for stamp_s in (0.5, 5.0, 1.7e9):
+        for first_s in (stamp_s, 0.0, 77.0):
+            found = point_times(first_s + sweep_s, stamp_s)
+            assert found is not None
+            np.testing.assert_allclose(found, sweep_s, atol=1e-6)
+    assert point_times(20.0 * sweep_s, 5.0) is None
+
+
+def test_scans_that_cannot_be_deskewed_are_told(tmp_path: Path) -> None:
+    long = drive(sweep_s=2.0)
+    folder = write_pcds(tmp_path / "run", long)
+    poses = write_trajectory(folder / "t.tum", long.stamps_s)
+    with pytest.warns(
+        InputWarning, match=r"run: 6 of 6 scans are not deskewed, .*: they span no sweep, 0\.004 to 1\.5 s"
+    ):
+        list(open_session(folder).scans())
+    list(open_session(folder, HowToRead(deskew=False)).scans())
+    lines = poses.read_text().splitlines()
+    poses.write_text("\n".join([lines[0], lines[0].split()[0] + lines[1][len(lines[0].split()[0]) :], *lines[2:]]))
+    with pytest.warns(
+        InputWarning, match="6 of 6 scans are not deskewed, .*: there are no two poses with times that rise"
+    ):
+        list(open_session(folder).scans())
+
+
 def test_a_trajectory_at_another_rate_is_interpolated(tmp_path: Path) -> None:
     folder = write_pcds(tmp_path / "run", MADE)
     np.savetxt(folder / "times.txt", START_NS / 1e9 + MADE.stamps_s, fmt="%.6f")
@@ -104,7 +171,9 @@ def test_a_trajectory_at_another_rate_is_interpolated(tmp_path: Path) -> None:
     (folder / "times.txt").unlink()
     assert "the scans have none (add times.txt" in said(folder, HowToRead(trajectory=tmp_path / "t.tum"))
     kitti = write_trajectory(tmp_path / "k.txt", MADE.stamps_s, "kitti")
-    assert worst_m(folder, HowToRead(trajectory=kitti)) > 0.3  # poses without times cannot deskew
+    with pytest.warns(InputWarning, match="6 of 6 scans are not deskewed, .*: there are no two poses with times"):
+        assert worst_m(folder, HowToRead(trajectory=kitti)) > 0.3
+    assert worst_m(folder, HowToRead(trajectory=kitti, deskew=False)) > 0.3
 
 
 def test_an_origin_is_subtracted_from_poses_alone(tmp_path: Path) -> None:
@@ -263,6 +332,36 @@ def test_tf_within_the_robot_is_no_way_where_odometry_is(tmp_path: Path) -> None
     assert worst_m(write_bag(tmp_path / "a.bag", MADE, "footprint")) < 1e-3
 
 
+def test_a_tf_that_repeats_itself_is_no_movement(tmp_path: Path) -> None:
+    assert worst_m(write_bag(tmp_path / "a.bag", MADE, "standing")) < 1e-3
+    assert "no poses of the sensor in it" in said(write_bag(tmp_path / "b.bag", MADE, "mounting"))
+    still = _Edge("map", np.array([5.0]), make_pose(np.eye(3), (1.0, 2.0, 4.0))[None])
+    found = _compose("tf", [still, _Edge("base_link", np.array([5.0]), make_pose(np.eye(3), (0.0, 0.0, 0.5))[None])])
+    assert found is not None
+    np.testing.assert_allclose(found.poses[:, :3, 3], [[1.0, 2.0, 4.5]])
+
+
+def test_a_sensor_that_stands_in_its_tf_stands_with_a_warning(tmp_path: Path) -> None:
+    (db3,) = write_bag(tmp_path / "ros2", MADE, "standing").glob("*.db3")
+    with closing(sqlite3.connect(db3)) as base, base:
+        base.execute("DELETE FROM messages WHERE topic_id = (SELECT id FROM topics WHERE name = '/odom')")
+    with pytest.warns(InputWarning, match="by its tf os_lidar stands in map, and so does the sensor"):
+        assert np.ptp(open_session(db3).odom_T_sensor, axis=0).max() == 0
+
+
+def test_registered_clouds_of_a_bag_are_moved_back(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "a.bag", MADE, "registered")
+    with pytest.warns(InputWarning, match="its clouds are in odom, the frame of the poses of /odom: they are taken as"):
+        source = open_session(path, HowToRead(origin_m=(0.0, 0.0, -50.0)))
+    np.testing.assert_allclose(source.odom_T_sensor[:, 2, 3], 50.0, atol=1.0)
+    for scan in source.scans():
+        found = transform(scan.odom_T_sensor, scan.points_sensor) - (0.0, 0.0, 50.0)
+        assert off_walls_m(found).max() < 1e-3
+    tum = write_trajectory(tmp_path / "t.tum", FINE_S)
+    with pytest.warns(InputWarning, match="/ouster/points: its frame is odom, which does not move with the sensor"):
+        open_session(path, HowToRead(trajectory=tum))
+
+
 def test_clouds_of_a_bag_without_a_return_are_left_out(tmp_path: Path) -> None:
     made = drive(8)
     clouds = list(made.clouds)
@@ -393,6 +492,17 @@ def test_seconds_and_nanoseconds_are_added_and_words_are_passed_over(tmp_path: P
     rows = "7,250000000,odom,1,2,3,0,0,0,1\n7,750000000,odom,1,2,3,0,0,0,1\n"
     (tmp_path / "t.csv").write_text(f"{names},frame_id,x,y,z,qx,qy,qz,qw\n{rows}")
     np.testing.assert_allclose(read_poses(tmp_path / "t.csv").time_s, [7.25, 7.75])
+
+
+@pytest.mark.parametrize(
+    ("name", "scale"),
+    [("time_ms", 1e3), ("timestamp_us", 1e6), ("time [ms]", 1e3), ("stamp_ns", 1e9), ("t (us)", 1e6), ("time_s", 1.0),
+     ("timestamp [ns]", 1e9)],
+)  # fmt: skip
+def test_the_unit_of_times_is_that_of_the_header(tmp_path: Path, name: str, scale: float) -> None:
+    rows = "".join(f"{time_s * scale:.0f},1,2,3,0,0,0,1\n" for time_s in (0, 1, 60))
+    (tmp_path / "t.csv").write_text(f"{name},x,y,z,qx,qy,qz,qw\n{rows}")
+    np.testing.assert_allclose(read_poses(tmp_path / "t.csv").time_s, [0, 1, 60])
 
 
 def test_the_unit_of_angles_is_that_of_the_header(tmp_path: Path) -> None:

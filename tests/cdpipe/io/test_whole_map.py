@@ -62,6 +62,15 @@ def test_a_map_is_opened_as_stations_that_hold_every_point(tmp_path: Path) -> No
     assert np.allclose(np.sort(read[:, 0]), np.sort(points[:, 0]), atol=1e-4)
 
 
+def test_a_map_on_a_regular_grid_repeats_nothing(tmp_path: Path) -> None:
+    along, across = np.arange(0, 24, 0.125), np.arange(-2, 2.01, 0.125)
+    floor = np.stack(np.meshgrid(along, across, [0.0], indexing="ij"), -1).reshape(-1, 3)
+    grid = np.concatenate([floor, floor + np.array([0, 0, 3.0])])
+    source = open_session(write(tmp_path / "map.ply", grid))
+    assert len(source.odom_T_sensor) > 3
+    assert sum(len(scan.points_sensor) for scan in source.scans()) == len(grid)
+
+
 def test_a_box_that_was_added_is_found(tmp_path: Path) -> None:
     before = write(tmp_path / "before.ply", drift(1))
     after = write(tmp_path / "after.ply", drift(2, has_box=True))

@@ -179,3 +179,8 @@ def test_nothing_within_range_and_poses_too_far_out() -> None:
         build_map(RandomScans(), MapConfig(max_range_m=0.001))
     with pytest.raises(InputError, match=r"random: .* 40000\d\d m"):
         build_map(RandomScans(offset_m=4_000_000.0), MapConfig())
+    # what the cells of the map could number, and the finer ones of the extraction cannot
+    with pytest.raises(
+        InputError, match=r"random: .* 600\d\d m, cells of 0\.05 m can be numbered up to 52429 m.*--origin"
+    ):
+        build_map(RandomScans(offset_m=60_000.0), MapConfig())

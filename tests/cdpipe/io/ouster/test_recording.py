@@ -12,10 +12,12 @@ import pytest
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from cdpipe.core.errors import InputWarning
 from cdpipe.core.geometry import Float64Array, make_pose, transform, yaw_pose
 from cdpipe.io.ouster.captures import open_recording
 from cdpipe.io.ouster.recording import import_recording
 from cdpipe.io.ply import read_ply_points
+from cdpipe.io.readers import HowToRead, import_ouster
 from cdpipe.io.session import read_session
 from cdpipe.io.tum import motion_along
 from tests.cdpipe.recordings import (
@@ -166,6 +168,25 @@ def test_a_trajectory_is_interpolated_to_every_column(tmp_path: Path) -> None:
         got = session.odom_T_sensor[scan] @ make_pose(Rotation.from_quat(quaternion).as_matrix(), (x, y, z))
         # between poses 10 ms apart a straight line leaves the bend by 0.3 / 4 * 0.01^2 m
         np.testing.assert_allclose(got, odom_T_sensor(0.1 * scan + 0.1 * column / 512), atol=1e-5)
+
+
+def test_an_origin_is_subtracted_and_no_deskewing_is_told(tmp_path: Path) -> None:
+    info = info_of(SENSOR)
+    path = write_frames(tmp_path / "r.osf", info, frames(info, 3))
+    tum = write_tum(tmp_path / "t.tum", -0.05, 0.4)
+    near, far = import_ouster(path, tmp_path / "near", HowToRead(trajectory=tum)), (432_000.0, 5_411_000.0, 300.0)
+    rows = np.loadtxt(tum, comments="#")
+    rows[:, 1:4] += far
+    np.savetxt(tmp_path / "far.tum", rows, fmt="%.9f")
+    with pytest.warns(InputWarning, match="deskewed in spite of --no-deskew"):
+        import_ouster(path, tmp_path / "far", HowToRead(trajectory=tmp_path / "far.tum", origin_m=far, deskew=False))
+    assert near.poses == "trajectory t.tum"
+    expected, got = (read_session(tmp_path / name).odom_T_sensor for name in ("near", "far"))
+    np.testing.assert_allclose(got, expected, atol=1e-6)
+    import_ouster(path, tmp_path / "own", HowToRead(origin_m=far))  # of its own poses, too
+    np.testing.assert_allclose(
+        read_session(tmp_path / "own").odom_T_sensor[:, 0, 3], expected[:, 0, 3] - far[0], atol=0.1
+    )
 
 
 def test_a_pose_per_revolution_at_its_first_column_is_enough(tmp_path: Path) -> None:

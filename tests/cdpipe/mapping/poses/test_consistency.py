@@ -154,6 +154,14 @@ def test_the_map_of_a_sensor_that_stands_has_no_more_than_200_scans() -> None:
     assert np.isin(chosen % 2, 0).all()  # halves stay apart
 
 
+def test_a_scan_with_nothing_near_keeps_its_pose(tunnel: CloudScans) -> None:
+    clouds = [tunnel.scan(index).points_sensor for index in range(12)]
+    clouds[6] = np.array([[25.0, 0.0, 0.0], [25.0, 1.0, 0.0]])
+    noisy = jittered(CloudScans("gap", tunnel.odom_T_sensor[:12], clouds), 0)
+    found = make_consistent(noisy).odom_T_sensor
+    assert np.abs(found[:, :3, 3] - noisy.odom_T_sensor[:, :3, 3]).max() < 6 * JITTER_M
+
+
 @pytest.mark.parametrize("n_scans", [1, 2])
 def test_a_session_of_a_scan_or_two_is_mapped(tunnel: CloudScans, n_scans: int) -> None:
     few = replaced(tunnel, tunnel.odom_T_sensor[:n_scans])
