@@ -46,6 +46,7 @@ class Recording(Settings):
     format: str | None = None
     topics: tuple[str, ...] = ()  # of a bag
     deskew: bool = True
+    origin_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)  # to subtract from poses in a map grid (UTM)
     clearance_m: Positive = 0.8  # between a prop and the path of the sensor, on the floor
     reach_m: Positive = 10.0  # from the path within which props stand
 

@@ -106,6 +106,7 @@ def tell_recordings(
     metadata: list[str] | None,
     *,
     deskew: bool,
+    origin: str | None,
 ) -> dict[str, Any]:
     """Return one or two recordings and how they are read, as keys of `scenarios.grafted.Recording`.
 
@@ -118,7 +119,7 @@ def tell_recordings(
         raise InputError(
             f"{len(paths)} recordings: expected one, which is split, two of one place, or --recording NAME"
         )
-    hows = how_to_read(len(paths), form, topics, trajectory, odometry, metadata, deskew=deskew)
+    hows = how_to_read(len(paths), form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin)
     told: dict[str, Any] = {"sessions": [str(path) for path in paths], "format": form, "topics": list(topics or ())}
     for name, option, files in (
         ("trajectories", "trajectory", [how.trajectory for how in hows]),
@@ -127,7 +128,7 @@ def tell_recordings(
         if any(files) and not all(files):
             raise InputError(f"--{option} -: a grafted pair takes a file for each of its recordings, or for none")
         told[name] = [str(file) for file in files if file is not None]
-    return {**told, "odometry": odometry, "deskew": deskew}
+    return {**told, "odometry": odometry, "deskew": deskew, "origin_m": hows[0].origin_m}
 
 
 def open_inputs(paths: Sequence[Path], hows: Sequence[HowToRead], progress: RunProgress) -> list[Path | ScanSource]:

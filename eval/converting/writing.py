@@ -83,7 +83,7 @@ def write_world(what: str, out: Path, name: str, seed: int | None, settings: Seq
     if is_pair(pair) and not with_truth:
         raise InputError(f"{pair}: the world of a pair is its truth: add --with-truth")
     if is_pair(pair) and (seed is not None or settings):
-        raise InputError(f"{pair}: a folder holds what was simulated: leave --seed and --set out")
+        raise InputError(f"{pair}: a folder holds what was simulated: leave --seed and --world out")
     with _output(out, form) as partial:
         view = view_pair(pair) if is_pair(pair) else view_scenario(load_scenario(what, seed or 0, settings), seed or 0)
         n_meshes, n_triangles = write_glb(view, partial)

@@ -85,7 +85,7 @@ def _how(recording: Recording, number: int) -> HowToRead:
     trajectory = Path(recording.trajectories[number]) if recording.trajectories else None
     metadata = Path(recording.metadata[number]) if recording.metadata else None
     told = recording.format, recording.topics, trajectory, recording.odometry, metadata, recording.deskew
-    return HowToRead(*told)
+    return HowToRead(*told, recording.origin_m)
 
 
 def _open(path: Path, how: HowToRead, folder: Path, on_progress: Progress) -> Session:
@@ -95,7 +95,10 @@ def _open(path: Path, how: HowToRead, folder: Path, on_progress: Progress) -> Se
         open_session(path, how)  # which refuses options that a session has no use for
         return read_session(path)
     if name not in OUSTER:
-        return as_session(open_session(path, how, on_progress))
+        source = open_session(path, how, on_progress)
+        if getattr(source, "is_whole_map", False):
+            raise InputError(f"{path}: a map without its scans has no rays to cast along: name the scans instead")
+        return as_session(source)
     folder.mkdir()
     session = folder / path.name
     import_ouster(path, session, how, on_progress)

@@ -16,11 +16,11 @@ from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
 from eval.core.terminal.printing import count_pairs
 from eval.leaderboard.reference import take_other_methods
 from eval.report.comparing.columns import COMPARED, figures_of, is_time
-from eval.report.comparing.differences import paired_differences, verdict
+from eval.report.comparing.differences import NOT_JUDGED, paired_differences, verdict
 from eval.report.render import write_file
 from eval.running.results.run_data import RunData
 from eval.running.results.sides import find_other_worlds
-from eval.tables.rows import PAIR, is_told_the_truth, numbers
+from eval.tables.rows import PAIR, is_told_the_truth, numbers, stated
 
 FIGURES = ("region_recall", "false_regions_per_100m", "object_iou_point", "object_f1_50", "t_total_s")
 HEADINGS = ("recall", "false/100m", "IoU", "F1 at 0.5", "time [s]")
@@ -67,10 +67,11 @@ def compare_with_reference(results: pd.DataFrame, name: str, references: Sequenc
     shared = own.index if not others else own.index[own.index.isin(_union(others))]
     rows = [summarise_figures(variant, each) for variant, each in {name: own.loc[shared], **others}.items()]
     paired = [
-        {"reference": variant, "n_pairs": len(rows), **row, "verdict": verdict(row)}
+        {"reference": variant, "n_pairs": len(rows), **row,
+         "verdict": NOT_JUDGED if is_time(row["metric"]) else verdict(row)}
         for variant, rows in others.items()
-        for row in paired_differences(rows[list(FIGURES)], own.loc[rows.index, list(FIGURES)])
-    ]
+        for row in paired_differences(_stated(rows), _stated(own.loc[rows.index]))
+    ]  # fmt: skip
     pairs = pd.DataFrame(list(_by_pair(own, others, calls)))
     return Comparison(
         pd.DataFrame(rows),
@@ -153,11 +154,15 @@ def summarise_figures(name: str, rows: pd.DataFrame) -> dict[str, Any]:
     """Return a row of `Comparison.table` from the figures of a method by pair."""
     row: dict[str, Any] = {"method": name, "n_pairs": len(rows), "n_answered": int((rows["status"] == "ok").sum())}
     for key in FIGURES:
-        values, statistic = numbers(rows, key), statistic_of(key)
+        values, statistic = stated(rows, key), statistic_of(key)
         row[key] = median(values) if statistic == "median" else mean(values)
         row[f"{key}_low"], row[f"{key}_high"] = bootstrap_interval(values, statistic)
         row[f"{key}_n"] = int(np.count_nonzero(~np.isnan(values)))
     return row
+
+
+def _stated(rows: pd.DataFrame) -> pd.DataFrame:
+    return pd.DataFrame({key: stated(rows, key) for key in FIGURES}, index=rows.index)
 
 
 def _by_pair(own: pd.DataFrame, others: Mapping[str, pd.DataFrame], calls: Pairs) -> Iterator[dict[str, Any]]:
@@ -194,7 +199,7 @@ def _notes(
         yield f"the table is over the {len(shared)} of {len(own)} pairs that have reference rows"
     if any(is_told_the_truth(variant) for variant in others):
         yield "oracle-* methods were told the true merge, or the true regions as well"
-    yield "times of different machines do not compare"
+    yield "times of different machines do not compare; a method that leaves one out has none"
 
 
 def note_other_worlds(results: pd.DataFrame, references: Sequence[RunData]) -> Iterator[str]:

@@ -148,8 +148,11 @@ def evaluate_command(
             progress.note(f"{pair.name} {pair.seed}: {error}")
     progress.cells("done", len(todo), len(todo))
     results = write_tables(run)
+    asked = {(pair.name, pair.seed) for pair in pairs}
     own = results[results["variant"] == method.name]
-    return EvaluationOutcome(len(todo), len(pairs) - len(todo), int((own["status"] != "ok").sum()))
+    failed = own[own["status"] != "ok"]
+    n_failed = sum(pair in asked for pair in zip(failed["scenario"], failed["seed"], strict=True))
+    return EvaluationOutcome(len(todo), len(pairs) - len(todo), n_failed)
 
 
 def evaluation_folder(run: RunFolder, name: str) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -111,7 +111,7 @@ def _make_board(group: Sequence[CheckedFile], reference: Path | None) -> Board:
     # a run in which a method was evaluated holds its rows, too
     references = [(name, found) for name, found in _list_references(data, pairs) if name not in own]
     rows += [(summarise_figures(name, found), "", True) for name, found in references]
-    rows.sort(key=lambda row: -_rank(row[0]["object_iou_point"]))
+    rows.sort(key=lambda row: _place(row[0]))
     title = f"Plan {first.plan}, {count_pairs(len(pairs))}{f', {first.split}' if first.split else ''}"
     return Board(title, tuple(_line(*row) for row in rows), tuple(_notes(group, data, len(pairs), rows)))
 
@@ -156,5 +156,8 @@ def _notes(
             yield f"{each.content.name} answered other simulations of {count_pairs(len(differing))} than {other}."
 
 
-def _rank(value: float) -> float:
-    return -math.inf if math.isnan(value) else value
+def _place(row: Mapping[str, Any]) -> tuple[float, ...]:
+    """Return what sorts the best first: F1, which false objects lower, then the others; alarms where all are NaN."""
+    high = (row["object_f1_50"], row["object_iou_point"], row["region_recall"])
+    order = (*(-value for value in high), row["false_regions_per_100m"])
+    return tuple(math.inf if math.isnan(value) else value for value in order)

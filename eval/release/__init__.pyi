@@ -1,9 +1,8 @@
-from .archive import join_pair, unpack_release
+from .archive import unpack_release
 from .content import load_release, release_names
 from .making import make_release
 
 __all__ = [
-    "join_pair",
     "load_release",
     "make_release",
     "release_names",

@@ -18,7 +18,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files import list_members, read_bytes, read_member, require_plain_file
 from cdpipe.core.names import LONGEST, visible
 from cdpipe.core.whole_file import whole_file
-from eval.core.output import copy_folder, new_folder
+from eval.core.output import new_folder
 from eval.core.terminal.progress import RunProgress, Silent
 
 SESSIONS, TRUTH, SUMS = "sessions", "truth", "SHA256SUMS"
@@ -110,26 +110,6 @@ def unpack_release(file: Path, out: Path, *, with_truth: bool = False, progress:
                 (partial / target).write_bytes(content)
                 pairs |= {Path(target).parts[0]} if "/" in target else set()
     return len(pairs)
-
-
-def join_pair(folder: Path, name: str, out: Path) -> None:
-    """Copy a pair of an unpacked release with its truth: the bytes that `tunnelcd simulate` wrote.
-
-    Args:
-        folder: The unpacked archive, or a release made as a folder.
-        name: Opaque name of the pair.
-        out: A new or empty folder.
-
-    Raises:
-        InputError: `out` cannot be written, or there is no such pair.
-    """
-    parts = [folder / kind / name for kind in (SESSIONS, TRUTH)]
-    for part in parts:
-        if not part.is_dir():
-            raise InputError(f"{part}: no such folder: name a pair of the release")
-    with new_folder(out) as partial:
-        for part in parts:
-            copy_folder(part, partial)
 
 
 def _place(name: str, *, with_truth: bool) -> str | None:

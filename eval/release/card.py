@@ -90,7 +90,7 @@ One row is the pairs of one family.
 
 | | |
 |---|---|
-| made by | `tunnelcd dataset --release {visible(release.name)} --out FILE.zip` |
+| made by | `tunnelcd dataset --release {visible(release.asked)} --out FILE.zip` |
 | version | {visible(release.version)}, published {release.published.isoformat()} |
 | set over the families | {settings} |
 | sensors | {sensors} |
@@ -98,8 +98,7 @@ One row is the pairs of one family.
 | digest of all pairs | `{digest}` |
 | licence | MIT, as tunnelcd itself: everything is simulated, nothing was recorded |
 
-With these settings the sensor has fewer columns, scans and mixed pixels than that of the reports, so scores differ
-from the published tables.
+Scores on other seeds, families or settings than those of the reports differ from the published tables.
 
 ## What lies where
 

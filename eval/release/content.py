@@ -23,6 +23,7 @@ from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.yamlfile import Settings, read_yaml, suggest, validate
 from eval.plans.seeds import parse_seeds_option
 from eval.plans.splits import load_splits, version_name
+from scenarios.grafted import GraftScenario
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
@@ -49,9 +50,10 @@ class ReleasePair:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Release:
-    """A release with its pairs, in the order of their opaque names."""
+    """A release with its pairs, in the order of their opaque names; `asked` is its name, or its file, as given."""
 
     name: str
+    asked: str
     version: str
     description: str
     published: date
@@ -85,7 +87,8 @@ def load_release(name_or_path: str) -> Release:
         lines = (line.removeprefix("--set: ") for line in str(error).splitlines())
         raise InputError("\n".join(f"{path}: {line}" for line in lines)) from error
     in_order = tuple(sorted(pairs, key=lambda pair: pair.name))
-    return Release(path.stem, version, content.description, content.published, content.settings, in_order)
+    asked = path.name if path.name == Path(name_or_path).name else name_or_path
+    return Release(path.stem, asked, version, content.description, content.published, content.settings, in_order)
 
 
 def _find(name_or_path: str) -> Path:
@@ -111,6 +114,8 @@ def _parse_seeds(path: Path, family: str, text: str) -> tuple[int, ...]:
 
 def _draw(family: str, seed: int, settings: tuple[str, ...], version: str) -> ReleasePair:
     scenario = load_scenario(family, seed, settings)
+    if isinstance(scenario, GraftScenario):
+        raise InputError(f"pairs.{family}: its world is a recording: a release holds simulated pairs alone")
     content = [version, family, seed, scenario.model_dump(mode="json"), file_digests(scenario)]
     name = hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=8).hexdigest()
     return ReleasePair(name, family, seed, scenario)

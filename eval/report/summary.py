@@ -30,10 +30,10 @@ from eval.tables.rows import (
     DOMAINS,
     PAIR,
     by_domain,
-    is_answered,
     is_told_the_truth,
     numbers,
     records,
+    stated,
     with_domain,
 )
 from eval.tables.surface.table import limit_column
@@ -89,17 +89,9 @@ def means_by_method(results: pd.DataFrame, columns: Sequence[Column]) -> pd.Data
         for variant, own in cases.groupby("variant", sort=False):
             row: dict[str, Any] = {"domain": domain, "variant": str(variant), "n_pairs": len(own)}
             for column in columns:
-                row |= _mean(_stated(own, column.key), column.key)
+                row |= _mean(stated(own, column.key), column.key)
             rows.append(row)
     return pd.DataFrame(rows)
-
-
-def _stated(own: pd.DataFrame, key: str) -> Float64Array:
-    """Return a column; of a cost nothing if an answer leaves it out: else a method would state it where it is small."""
-    values = numbers(own, key)
-    is_cost = key.startswith(("t_total", "bytes_"))  # seconds per region are undefined where no region is proposed
-    is_left_out = np.isnan(values) & is_answered(own)
-    return np.full(len(values), np.nan) if is_cost and is_left_out.any() else values
 
 
 def is_unmade(row: Row) -> bool:

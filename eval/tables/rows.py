@@ -62,6 +62,17 @@ def is_answered(cases: pd.DataFrame) -> BoolArray:
     return told.to_numpy(dtype=np.bool_)
 
 
+def stated(cases: pd.DataFrame, column: str) -> Float64Array:
+    """Return an (N,) column of the rows of one method as numbers; of a cost that some answer leaves out, NaN for all.
+
+    Else a method could state it where it is small.
+    """
+    values = numbers(cases, column)
+    is_cost = column.startswith(("t_total", "bytes_"))  # seconds per region are undefined where no region is proposed
+    is_left_out = np.isnan(values) & is_answered(cases)
+    return np.full(len(values), np.nan) if is_cost and is_left_out.any() else values
+
+
 def by_domain(results: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     """Yield the rows of each domain that is present, and all rows where both are.
 

@@ -23,7 +23,7 @@ from eval.cli.inputs import (
     open_inputs,
     open_sources,
 )
-from eval.cli.options import Quiet, SetSettings
+from eval.cli.options import OldWorldSettings, Quiet, WorldSettings, join_world_settings, world_mistakes
 from eval.core.terminal.printing import say, shown_warnings
 from eval.core.terminal.progress import RunProgress, shown_progress
 
@@ -57,7 +57,8 @@ def convert(
     seed: Annotated[
         int | None, typer.Option(min=0, help="seed of a scenario; 0 if left out", show_default=False)
     ] = None,
-    settings: SetSettings = None,
+    world: WorldSettings = None,
+    settings: OldWorldSettings = None,
     quiet: Quiet = False,
 ) -> None:
     """Convert a session, an answer or a world to a format of other tools; or a recording to a session.
@@ -73,20 +74,22 @@ def convert(
 
     if len(sources) not in (1, _ANSWER):
         raise InputError(f"{len(sources)} inputs: expected one, or BEFORE AFTER ANSWER, and then the output")
+    asked = join_world_settings(world, settings)
     hows = how_to_read(min(len(sources), 2), form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin)
     with shown_warnings(), shown_progress(quiet) as progress:
         if len(sources) == _ANSWER:
             _refuse_truth(sources[-1], with_truth)
+            _refuse_world(sources[-1], seed, asked)
             say(quiet, _convert_answer(sources, out, to, hows, cell_m, progress))
             return
         source = sources[0]
         if _is_world(source, out, to):
             if hows != [HowToRead()]:
                 raise InputError(f"{source}: a world has no recording to read: leave --trajectory and the like out")
-            say(quiet, _convert_world(source, out, to, seed, settings or (), with_truth=with_truth))
+            with world_mistakes():
+                say(quiet, _convert_world(source, out, to, seed, asked, with_truth=with_truth))
             return
-        if seed is not None or settings:
-            raise InputError(f"{source}: a session holds what was recorded: leave --seed and --set out")
+        _refuse_world(source, seed, asked)
         if _is_session(source, hows[0]):
             say(quiet, _export(source, out, to, None, progress, cell_m, with_truth=with_truth))
             return
@@ -103,6 +106,13 @@ def _refuse_truth(source: Path, with_truth: bool) -> None:
 
     if with_truth:
         raise InputError(f"{source}: a recording has no truth: leave --with-truth out")
+
+
+def _refuse_world(source: Path, seed: int | None, settings: Sequence[str]) -> None:
+    from cdpipe.core.errors import InputError
+
+    if seed is not None or settings:
+        raise InputError(f"{source}: a session holds what was recorded: leave --seed and --world out")
 
 
 def _is_world(source: Path, out: Path, to: str | None) -> bool:

@@ -269,6 +269,8 @@ def report(
 
         if other is not None or against is not None or out is not None:
             raise InputError("--index: an index is of one folder of reports: leave B, --against and --out out")
+        if views != "chosen" or keep or not slim:
+            raise InputError("--index: an index has no pictures: leave --views, --keep and --sharp out")
         echo(f"page: {write_index(Path(folder))}")
         return
     if other is None and against is None:
@@ -282,8 +284,8 @@ def report(
             page = write_page(run.path, views, is_slim=slim, keeps=keep, progress=progress)
         echo(f"page: {page}")
         return
-    if not slim:
-        raise InputError("--sharp: the page of a comparison has no pictures to compress: leave it out")
+    if views != "chosen" or keep or not slim:
+        raise InputError("the page of a comparison has no pictures: leave --views, --keep and --sharp out")
     if other is not None and against is not None:
         raise InputError(f"--against {against}: a second run is named too: write {folder}:{against} {other} instead")
     from eval.report.comparing.page import compare_sides, write_comparison

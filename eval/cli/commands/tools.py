@@ -255,6 +255,7 @@ def check_file(name_or_path: str) -> str:
     from eval.plans.files import plan_names
     from eval.plans.plan import Plan, load_plan
     from scenarios import check_scenario, scenario_names
+    from scenarios.library import CHECKED_SEEDS, load_grafted
     from scenarios.schema import Scenario
 
     names = {"plan": plan_names(), "scenario": scenario_names(), "preset": preset_names()}
@@ -274,6 +275,10 @@ def check_file(name_or_path: str) -> str:
         }
         content = read_yaml(Path(name_or_path)).value
         own = set(content) if isinstance(content, dict) else set()
+        if own & {"props", "surface"} and not own & {"tunnel", "extends", "recording"}:
+            for seed in CHECKED_SEEDS:  # any file may stand for the recording
+                load_grafted(name_or_path, {"sessions": [name_or_path]}, seed)
+            return "a file of props and rock for `graft --objects`"
         kind = max(keys, key=lambda name: len(own & keys[name]))
     if kind == "plan":
         return f"a plan of {len(expand_cells(load_plan(name_or_path)))} cells"
@@ -292,11 +297,13 @@ def _open_meshes(scenario: str) -> None:
         ScenarioError: Some cannot be used: one line each.
     """
     from cdpipe.core.errors import ScenarioError
+    from scenarios.grafted import GraftScenario
     from scenarios.library import CHECKED_SEEDS, load_scenario
     from sim.rock.foreign import prop_mesh, tunnel_mesh
 
     drawn = [load_scenario(scenario, seed) for seed in CHECKED_SEEDS]
-    tunnels = dict.fromkeys(each.tunnel.mesh for each in drawn if each.tunnel.mesh)
+    simulated = [each for each in drawn if not isinstance(each, GraftScenario)]  # the walls of the others are recorded
+    tunnels = dict.fromkeys(each.tunnel.mesh for each in simulated if each.tunnel.mesh)
     props = dict.fromkeys((prop.mesh, prop.name) for each in drawn for prop in each.props if prop.mesh)
     mistakes = []
     for read in [*(partial(tunnel_mesh, mesh) for mesh in tunnels), *(partial(prop_mesh, *prop) for prop in props)]:

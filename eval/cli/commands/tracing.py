@@ -3,6 +3,7 @@
 # ruff: noqa: PLC0415 - heavy imports stand inside the functions, so that --help and completion are instant
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -57,7 +58,7 @@ def trace(
         quiet,
         f"{out}: {found.length_m:.0f} m of drift, {widths[0]:.1f} to {widths[-1]:.1f} m wide, "
         f"{len(found.nodes)} nodes, a route from {draft.route[0]} to {draft.route[-1]}; look at {picture}, "
-        f"then run tunnelcd simulate {out}",
+        f"then run tunnelcd simulate {shlex.quote(str(out))} --out pair",
     )
 
 

@@ -76,13 +76,19 @@ def dataset(
     from eval.training.dataset import Recipe
     from eval.training.dataset_run import make_dataset
 
-    where, asked = Where(workers, scheduler), join_world_settings(world, settings)
+    where = Where(workers, scheduler)
+    recipe = Recipe(draws, error_m, error_deg, tuple(join_world_settings(world, settings)), afters)
     if out is None:
         raise InputError("dataset: no place for the data: name it with --out")
     if release is not None or unpack is not None:
+        if release is not None and unpack is not None:
+            raise InputError("--release packs pairs, --unpack unpacks them: name one of both")
         what = f"--release {release}" if unpack is None else f"--unpack {unpack}"
-        if families or seeds or asked or (release and unpack):
-            raise InputError(f"{what}: has pairs and settings of its own: leave FAMILY, --seeds and --world out")
+        if families or seeds or recipe != Recipe():
+            more = "FAMILY, --seeds, --world, --draws, --error-m, --error-deg and --afters"
+            raise InputError(f"{what}: has pairs and settings of its own: leave {more} out")
+        if unpack is not None and (where != Where() or limit is not None):
+            raise InputError(f"{what}: it is unpacked here and as a whole: leave --workers, --scheduler, --limit out")
         if with_truth and unpack is None:
             raise InputError("--with-truth: a release holds the truth, apart from the sessions: leave it out")
         _release_or_unpack(release, unpack, out, where, limit, quiet=quiet, with_truth=with_truth)
@@ -92,7 +98,6 @@ def dataset(
             "dataset: expected FAMILY... with --seeds A:B and --out DIR; --release NAME with --out FILE.zip; or "
             "--unpack FILE.zip with --out DIR"
         )
-    recipe = Recipe(draws, error_m, error_deg, tuple(asked), afters)
     require_usable(where)
     require_reachable(where)
     warn(exposure(where))

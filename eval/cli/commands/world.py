@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from eval.cli.inputs import RECORDING, Deskew, Format, Metadata, Odometry, Topics, Trajectories, tell_recordings
+from eval.cli.inputs import RECORDING, Deskew, Format, Metadata, Odometry, Origin, Topics, Trajectories, tell_recordings
 from eval.cli.options import (
     Families,
     OldWorldSettings,
@@ -98,18 +98,22 @@ def graft(
     odometry: Odometry = None,
     metadata: Metadata = None,
     deskew: Deskew = True,
+    origin: Origin = None,
     quiet: Quiet = False,
 ) -> None:
     """Cast props into real recordings and move rock: DIR/before, DIR/after, and DIR/truth as `simulate` writes it."""
+    from cdpipe.core.errors import InputError
     from eval.graft.adapters import locate_recording
     from eval.graft.making import make_pair
     from eval.graft.telling import tell_pair
     from scenarios.library import load_grafted
     from sim.session.truth import read_pair_truth
 
+    if root is not None and recording is None:
+        raise InputError("--root: it holds the files of a public recording: name that with --recording")
     public = {} if recording is None else locate_recording(recording, root)
     paths = [*(recordings or []), *(Path(name) for name in public.get("sessions", ()))]
-    told = tell_recordings(paths, form, topics, trajectory, odometry, metadata, deskew=deskew)
+    told = tell_recordings(paths, form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin)
     for name in ("format", "topics", *(() if trajectory else ("odometry",))):
         told[name] = told[name] or public.get(name, told[name])  # what is said on the command line holds
     told |= {"split": split, "clearance_m": clearance_m, "reach_m": reach_m}

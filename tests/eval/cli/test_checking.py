@@ -42,6 +42,18 @@ def test_the_meshes_that_a_scenario_names_are_opened(tmp_path: Path) -> None:
     assert check_file(str(path)) == "a scenario"
 
 
+def test_files_of_props_and_scenarios_in_a_recording_are_checked(tmp_path: Path) -> None:
+    props = "props:\n  - {name: box, kind: box, size_m: [0.9, 0.7, 0.8], change: added}\n"
+    (tmp_path / "props.yaml").write_text(props)
+    assert check_file(str(tmp_path / "props.yaml")) == "a file of props and rock for `graft --objects`"
+    (tmp_path / "drive.osf").write_bytes(b"x")
+    (tmp_path / "scenario.yaml").write_text("recording: {sessions: [drive.osf]}\n" + props)
+    assert check_file(str(tmp_path / "scenario.yaml")) == "a scenario"
+    (tmp_path / "props.yaml").write_text(props.replace("kind: box", "kind: bx"))
+    with pytest.raises(InputError, match=r"props\.yaml:2: props\.0\.kind = 'bx': .* did you mean \"box\"\?$"):
+        check_file(str(tmp_path / "props.yaml"))
+
+
 @pytest.mark.parametrize(("name", "kind"), [("smoke", "plan"), ("narrow", "scenario"), ("paper-topn", "preset")])
 def test_shipped_names_are_known(name: str, kind: str) -> None:
     assert f"a {kind}" in check_file(name)

@@ -45,6 +45,11 @@ def test_what_detect_says_of_recordings_and_their_options(tmp_path: Path, comman
     (tmp_path / "ours").mkdir()
     (tmp_path / "ours" / "session.json").write_text("{}")
     refused(command("detect", tmp_path / "ours", folder, *both, "kiss-icp", *out), "--odometry: no recording needs it")
+    refused(command("detect", folder, folder, *both[:4], "--topic", "/x", *out), "run is no bag: leave it out")
+    sensors = ("--metadata", "-", "--metadata", "m.json")
+    refused(command("detect", bag, folder, *sensors, *out), "run: --metadata is the sensor of a .pcap")
+    refused(command("view", tmp_path / "ours", "--trajectory", poses, "--html", tmp_path / "v.html"), "its own poses")
+    refused(command("view", "smoke/one_box", "--no-deskew", "--html", tmp_path / "v.html"), "a world has no recording")
     refused(command("describe", bag, "--format", "pdf"), "--format pdf: expected one of session")
     assert not (tmp_path / "out").exists()
 

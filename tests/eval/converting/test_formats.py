@@ -306,7 +306,7 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
         ((before, tmp_path / "a", "--to", "mcpa"), "--to mcpa: expected one of osf, pcap, mcap"),
         ((before, tmp_path / "a.pcap", "--with-truth"), "has no room for the truth"),
         ((before, before, tmp_path / "a.laz"), "2 inputs: expected one, or BEFORE AFTER ANSWER"),
-        ((before, tmp_path / "a.laz", "--seed", "3"), "leave --seed and --set out"),
+        ((before, tmp_path / "a.laz", "--seed", "3"), "leave --seed and --world out"),
         (("smoke/one_bx", tmp_path / "a.glb"), 'scenario "smoke/one_bx": unknown'),
     ):
         refused(command("convert", *arguments), expected)

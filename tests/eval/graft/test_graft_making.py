@@ -11,6 +11,7 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import invert, transform
+from cdpipe.io.ply import write_ply_points
 from cdpipe.io.readers import RecordedScans, open_session
 from cdpipe.io.session import read_session
 from cdpipe.pipeline import detect
@@ -89,6 +90,16 @@ def test_bare_points_are_rays_to_the_millimetre(simulated: Path, tmp_path: Path,
         assert np.abs(points - made).max() < 6e-4
         off = np.cross(points, made) / np.linalg.norm(points, axis=1, keepdims=True)
         assert np.linalg.norm(off, axis=1).max() < 2e-5  # across the ray
+
+
+def test_a_map_without_its_scans_is_no_recording_to_graft_into(tmp_path: Path, command: Command) -> None:
+    around, along = np.meshgrid(np.linspace(0, 2 * np.pi, 90), np.arange(0, 30, 0.2))
+    points = np.stack([along, 2.5 * np.cos(around), 2.5 * np.sin(around)], axis=-1).reshape(-1, 3)
+    write_ply_points(tmp_path / "map.ply", points, {})
+    code, _, err = command("graft", tmp_path / "map.ply", "--out", tmp_path / "pair")
+    assert code == 2
+    assert "map.ply: a map without its scans has no rays to cast along" in err
+    assert [path.name for path in tmp_path.iterdir()] == ["map.ply"]
 
 
 def test_props_are_cast_into_bare_points(simulated: Path, tmp_path: Path, command: Command) -> None:
@@ -172,6 +183,8 @@ def test_a_plan_names_the_file_of_a_recording(
         (("{s}", "--objects", "no-such"), "no-such"),
         (("{s}", "--split", "passes"), "no way is driven twice"),
         (("{s}", "--odometry", "kiss-icp"), "a session has its own poses"),
+        (("{s}", "--origin", "1,2,3"), "a session has its own poses"),
+        (("{s}", "--root", "x"), "--root: it holds the files of a public recording"),
         (("{s}/nowhere",), "no such file"),
         (("--recording", "conslm"), 'did you mean "conslam"'),
         (("--recording", "conslam"), "give --root DIR"),

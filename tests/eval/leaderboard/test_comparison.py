@@ -64,6 +64,19 @@ def test_means_differences_and_pairs_by_hand(tmp_path: Path) -> None:
     assert len(pd.read_csv(tmp_path / "out" / "differences.csv")) == 6
 
 
+def test_a_time_stated_where_it_is_small_counts_nothing_and_no_time_is_judged(tmp_path: Path) -> None:
+    frame = table()
+    frame.loc[frame["variant"] == "a", "status"] = "failed"
+    frame.loc[(frame["variant"] == "mine") & (frame["seed"] == 1), "t_total_s"] = 0.01
+    data = [take_other_methods(read(tmp_path / "run", frame), "mine")]
+    assert math.isnan(compare_with_reference(own(frame), "mine", data, {}).table["t_total_s"][0])
+    frame.loc[frame["variant"] == "mine", "t_total_s"] = 0.01
+    found = compare_with_reference(own(frame), "mine", data, {})
+    assert found.table["t_total_s"][0] == 0.01
+    verdicts = found.paired.set_index(["reference", "metric"])["verdict"]
+    assert verdicts["tunnelcd", "t_total_s"] == "not judged" != verdicts["tunnelcd", "object_f1_50"]
+
+
 def test_the_table_fits_80_columns(tmp_path: Path) -> None:
     frame = table().replace({"variant": {"a": "a-method-with-a-very-long-name-indeed"}})
     frame.loc[frame["variant"] == "tunnelcd", "t_total_s"] = [1234.5, 0.00123, 99.9]

@@ -186,6 +186,15 @@ def test_the_folder_says_what_was_evaluated(evaluator: Evaluator) -> None:
     assert plan["name"] == "smoke" and plan["variants"] == []
 
 
+def test_failures_are_those_of_the_pairs_that_were_asked(evaluator: Evaluator) -> None:
+    def draw(name: str, seed: int, settings: tuple[str, ...] = ()) -> Scenario:
+        raise ScenarioError(f"{name} does not fit")
+
+    assert evaluator.evaluate(tools=replace(TOOLS, draw=draw)).n_failed == 2
+    evaluator.plan = evaluator.plan.model_copy(update={"scenarios": evaluator.plan.scenarios[1:]})
+    assert evaluator.evaluate(tools=replace(TOOLS, draw=draw)).n_failed == 1
+
+
 def test_the_merge_that_is_given_is_the_true_one_along_the_path(tmp_path: Path, write_tiny_pair: object) -> None:
     pair = write_tiny_pair(stretch=1.05)  # type: ignore[operator] # the odometry of both sessions drifts
     truth = load_ground_truth(pair)

@@ -281,7 +281,7 @@ def test_other_pairs_are_another_table_and_one_name_stands_once(packed: Path, tm
 
 def test_reference_rows_are_of_the_same_pairs(packed: Path, tmp_path: Path) -> None:
     found = read_submission(packed)
-    rows = [{**pair.row, "variant": "ours", "object_iou_point": 0.75} for pair in found.content.pairs]
+    rows = [{**pair.row, "variant": "ours", "object_f1_50": 0.75} for pair in found.content.pairs]
     other = {**rows[0], "variant": "elsewhere", "seed": 4}
     (tmp_path / "report").mkdir()
     own = [pair.row for pair in found.content.pairs]  # as in the run in which the method was evaluated
@@ -289,7 +289,13 @@ def test_reference_rows_are_of_the_same_pairs(packed: Path, tmp_path: Path) -> N
     write_leaderboard([found], tmp_path / "board.html", tmp_path / "report", [0])
     page = (tmp_path / "board.html").read_text()
     assert page.count('class="reference"') == 1 and "ours" in page and "elsewhere" not in page
-    assert page.index('class="reference"') < page.index('class="entry"')  # the best IoU stands first
+    assert page.index('class="reference"') < page.index('class="entry"')  # the best F1 stands first
+    for pair in rows:  # false objects lower F1 and leave IoU as it is
+        pair |= {"object_f1_50": -0.1, "object_iou_point": 1.0}
+    pd.DataFrame(rows).to_csv(tmp_path / "report" / "results.csv", index=False)
+    write_leaderboard([found], tmp_path / "board.html", tmp_path / "report", [0])
+    page = (tmp_path / "board.html").read_text()
+    assert page.index('class="reference"') > page.index('class="entry"')
 
 
 def test_only_earlier_results_are_replaced_by_results(evaluated: RunFolder, packed: Path, tmp_path: Path) -> None:

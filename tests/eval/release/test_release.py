@@ -16,7 +16,7 @@ from cdpipe.core.errors import InputError
 from eval.core.cluster import Where
 from eval.plans.splits import load_splits
 from eval.release import making
-from eval.release.archive import join_pair, list_files, pack, read_sums, unpack_release, write_sums
+from eval.release.archive import list_files, pack, read_sums, unpack_release, write_sums
 from eval.release.content import load_release, release_names
 from eval.release.making import make_release
 from scenarios.library import load_scenario
@@ -84,7 +84,8 @@ def test_sessions_and_truth_together_are_the_simulated_pair(
         archive.extractall(tmp_path / "raw")
     rows = read_rows(tmp_path / "raw" / "truth" / "pairs.csv")
     name = next(row["name"] for row in rows if row["family"] == "smoke/one_box")
-    join_pair(tmp_path / "raw", name, tmp_path / "pair")
+    unpack_release(made, tmp_path / "pairs", with_truth=True)
+    (tmp_path / "pairs" / name).rename(tmp_path / "pair")
     original = simulated_once(load_scenario("smoke/one_box", 20000, SETTINGS), 20000)
     assert list_files(tmp_path / "pair") == list_files(original)
     for each in list_files(original):
@@ -117,6 +118,29 @@ def test_a_trivial_answer_to_an_unpacked_pair_is_scored(made: Path, tmp_path: Pa
     }
     assert scores["smoke/one_box"]["region_recall"] == 0
     assert scores["smoke/one_box"]["n_changes"] == 1 and scores["smoke/unchanged"]["n_changes"] == 0
+
+
+def test_options_that_a_release_has_no_use_for(tmp_path: Path, command: Command) -> None:
+    out = ("--out", tmp_path / "x")
+    for words, told in (
+        (("--release", "lite", "--unpack", "r.zip"), "name one of both"),
+        (("--release", "lite", "--draws", "3"), "leave FAMILY, --seeds, --world, --draws"),
+        (("--unpack", "r.zip", "--workers", "2"), "leave --workers, --scheduler, --limit out"),
+    ):
+        code, _, err = command("dataset", *words, *out)
+        assert (code, told in err) == (2, True), err
+
+
+def test_a_card_names_the_file_and_a_recording_is_refused(made: Path, tiny: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(made) as archive:
+        assert f"`tunnelcd dataset --release {tiny.name} --out FILE.zip`" in archive.read("README.md").decode()
+    assert load_release("lite").asked == "lite"
+    (tmp_path / "drive.osf").write_bytes(b"x")
+    (tmp_path / "rec.yaml").write_text("recording: {sessions: [drive.osf]}\nprops: []\n")
+    pairs = {str(tmp_path / "rec.yaml"): "20000:20001"}
+    (tmp_path / "own.yaml").write_text(f"description: x\npublished: 2026-11-26\npairs: {json.dumps(pairs)}\n")
+    with pytest.raises(InputError, match=r"own\.yaml: pairs\..*rec\.yaml: its world is a recording"):
+        load_release(str(tmp_path / "own.yaml"))
 
 
 def test_digests_are_of_all_files_and_those_of_other_programs(made: Path, tmp_path: Path) -> None:
