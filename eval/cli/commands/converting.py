@@ -139,8 +139,8 @@ def _is_session(source: Path, how: HowToRead) -> bool:
     if is_session(source / "before"):
         raise InputError(f"{source}: a pair of sessions: convert {source / 'before'} and {source / 'after'} one by one")
     if is_session(source) and how != HowToRead():
-        given = {"metadata": how.metadata, "trajectory": how.trajectory, "odometry": how.odometry, "format": how.format}
-        given |= {"topic": how.topics or None, "no-deskew": None if how.deskew else True}
+        given: dict[str, object] = {"metadata": how.metadata, "trajectory": how.trajectory, "odometry": how.odometry}
+        given |= {"format": how.format, "topic": how.topics or None, "no-deskew": None if how.deskew else True}
         name = next((name for name, value in given.items() if value is not None), "origin")
         meant = " (the format that is written is --to)" if name == "format" else ""
         raise InputError(f"{source}: a session has its own poses and sensor: leave --{name} out{meant}")
