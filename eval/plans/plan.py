@@ -32,7 +32,7 @@ axes:                                # eval/plans/axes.py: the first scenario, m
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
@@ -299,17 +299,27 @@ def list_methods(plan: Plan, world: World) -> list[Method]:
     for grid in plan.grid:
         if not grid.scenarios or not places.keys().isdisjoint(grid.scenarios):
             methods += [
-                Method(preset, point, shared=plan.set, site=site) for preset in grid.variant for point in grid.points
-            ]
+                Method(preset, point, _silent(plan, preset, places, point), shared=plan.set, site=site)
+                for preset in grid.variant for point in grid.points
+            ]  # fmt: skip
     if world.label == plan.base.label:
         methods += [with_step(method, step) for step in method_steps(plan.axes) for method in [*methods]]
     return [_with_threshold(method, plan.thresholds.get(method.variant)) for method in methods]
 
 
 def with_step(method: Method, step: tuple[str, ...]) -> Method:
-    """Return a method with the settings of a step of an axis, over those of its own name."""
+    """Return a method with the settings of a step of an axis, over those of its own name and of its site."""
     keys = set(map(get_key, step))
-    return replace(method, named=(*(each for each in method.named if get_key(each) not in keys), *step))
+    named, silent = (tuple(each for each in own if get_key(each) not in keys) for own in (method.named, method.silent))
+    return replace(method, named=(*named, *step), silent=silent)
+
+
+def _silent(plan: Plan, preset: str, places: Iterable[str], point: Sequence[str]) -> tuple[str, ...]:
+    """Return the settings of a site at a grid point: those of the plan's plain variant of the preset, less its own."""
+    plain = [each for each in plan.variants if each.preset == preset and not each.set and each.oracle_merge is None]
+    own = set(map(get_key, point))
+    found = (setting for each in plain[:1] for place in places for setting in each.per_scenario.get(place, ()))
+    return tuple(setting for setting in found if get_key(setting) not in own)
 
 
 def _with_threshold(method: Method, threshold: float | None) -> Method:

@@ -20,8 +20,9 @@ from eval.core.domains import domain_name
 from eval.core.statistics import mean, mean_with_interval, median
 from eval.report.drawing.charts import Chart
 from eval.report.drawing.looks import look_of
+from eval.report.pooled import pooled_recalls
 from eval.running.results.cases import comparable
-from eval.running.results.run_data import RunData, stored_table
+from eval.running.results.run_data import RunData
 from eval.tables.rows import ALL_DOMAINS, DOMAINS, is_told_the_truth, numbers, records
 
 _RECALL_AT_RATE, _RECALL_AT_K, _F1 = "recall_at_0.1", "region_recall_at_k", "object_f1_50"
@@ -65,12 +66,13 @@ def pareto_table(data: RunData) -> pd.DataFrame:
         `quality_value` with its 95 % interval `low` to `high` over session pairs; `cost_value` (seconds, bytes);
         `is_on_front`. No row where fewer than two methods have both.
     """
-    results, stored = comparable(data), stored_table(data, "regions_table")
+    results = comparable(data)
+    pooled = pooled_recalls(data, results)
     found: list[pd.DataFrame] = []
     for domain in [name for name in DOMAINS if name != ALL_DOMAINS and len(results)]:
         methods = results[results["domain"] == domain].groupby("variant", sort=False)
-        for quality in (_RECALL_AT_RATE if len(stored) else _RECALL_AT_K, _F1):
-            values = {name: _quality(own, quality, stored) for name, own in methods}
+        for quality in (_RECALL_AT_RATE if len(pooled) else _RECALL_AT_K, _F1):
+            values = {name: _quality(own, quality, pooled) for name, own in methods}
             for cost in (_TIME, _BYTES):
                 rows = [
                     {"quality": quality, "cost": cost, "domain": domain, "variant": name, "n_pairs": len(own),
@@ -81,12 +83,12 @@ def pareto_table(data: RunData) -> pd.DataFrame:
     return pd.DataFrame([row for table in found for row in records(table)], columns=list(COLUMNS))
 
 
-def _quality(own: pd.DataFrame, quality: str, stored: pd.DataFrame) -> dict[str, float]:
+def _quality(own: pd.DataFrame, quality: str, pooled: pd.DataFrame) -> dict[str, float]:
     """Return value, interval and number of pairs; recall at a rate is looked up, everything else is a mean."""
     if quality != _RECALL_AT_RATE:
         values = mean_with_interval(numbers(own, quality))
     else:
-        row = stored.merge(own[["domain", "variant"]].drop_duplicates(), on=["domain", "variant"])
+        row = pooled.merge(own[["domain", "variant"]].drop_duplicates(), on=["domain", "variant"])
         value, low, high = (mean(numbers(row, f"{quality}{end}")) for end in ("", "_low", "_high"))
         values = (value, low, high, int(np.count_nonzero(numbers(own, "n_observable") > 0)))
     return dict(zip(("quality_value", "low", "high", "n_quality"), values, strict=True))

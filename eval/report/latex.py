@@ -18,13 +18,14 @@ import pandas as pd
 
 from cdpipe.core.names import visible
 from eval.core.statistics import paired_difference
-from eval.report.comparing.columns import COMPARED, POOLED
+from eval.report.comparing.columns import COMPARED
 from eval.report.comparing.differences import BETTER, WORSE, pooled_difference, verdict
 from eval.report.objects.tables import OBJECT_COLUMNS
+from eval.report.pooled import POOLED
 from eval.report.regions.regions import REGION_COLUMNS
-from eval.report.summary import is_unmade, means_by_method
+from eval.report.summary import means_by_method
 from eval.report.tables import Table, methods_table
-from eval.running.results.cases import comparable
+from eval.running.results.cases import comparable, is_unmade
 from eval.running.results.grids import off_grids
 from eval.running.results.run_data import RunData, plan_name, stored_table
 from eval.running.results.sides import Side, is_contended

@@ -93,8 +93,9 @@ def write_page(
             holds a link or cannot be written.
     """
     require_no_links(run)
-    data = figures_of_plan(read_run(run))
-    check_versions(Side(data), Side(data))
+    whole = read_run(run)
+    check_versions(Side(whole), Side(whole))
+    data = figures_of_plan(whole)
     check_extras(Side(data))
     try:
         kept = read_kept(run / "index.html") if keeps else KeptPage()
@@ -111,11 +112,12 @@ def write_page(
 
 def _draw(data: RunData, views: Views, kept: KeptPage, *, is_slim: bool) -> dict[str, str | bytes]:
     """Return every file of a page by its name."""
-    merges = merge_table(pd.DataFrame(list(data.results)), read_targets(data.provenance))
+    targets = read_targets(data.provenance)
+    merges = merge_table(pd.DataFrame(list(data.results)), targets)
     content = _about(data, merges)
     files: dict[str, str | bytes] = {**latex_tables(data)}
     if len(merges):
-        files["merge.csv"] = merges.to_csv(index=False)
+        files["merge.csv"] = merge_table(pd.DataFrame(list(data.every_result)), targets).to_csv(index=False)
     if not ends_at_merge(data):
         hardness = draw_hardness(data)
         if hardness is not None:
@@ -138,6 +140,7 @@ def _draw(data: RunData, views: Views, kept: KeptPage, *, is_slim: bool) -> dict
     content["is_slim"] = is_slim
     content["missing"] = list(dict.fromkeys([*data.left_out, *content["missing"], *content["merge"].missing]))
     content = keep(content, kept)
+    content["missing"] = list(dict.fromkeys([*data.left_out, *content["missing"]]))
     files["index.html"] = render_page("page.html", content | _define(data, content))
     files |= {f"{chart.name}.png": chart.png for chart in content["charts"] if chart.has_png}
     return files

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,8 @@ def draw_scenarios(data: RunData) -> list[Chart]:
     worlds = scenarios(data, unchanged=False)
     methods = list(dict.fromkeys(name for world in worlds for name in named_variants(data, world)))
     # what is set over a method belongs to the charts of settings
-    methods = [name for name in methods if not split_variant(name)[1]][:_MAX_METHODS]
+    methods = [name for name in methods if not split_variant(name)[1]]
+    n_methods, methods = len(methods), _best(data, methods)
     sizes = {world: len({row["seed"] for row in select_rows(data.results, scenario=world)}) for world in worlds}
     if len(methods) < 2 or max(sizes.values(), default=0) < 2:
         return []
@@ -48,4 +50,14 @@ def draw_scenarios(data: RunData) -> list[Chart]:
         "Means over the n session pairs of each scenario, 0 for a pair without an answer (AUROC: 0.5); bars: 95 % "
         "interval over pairs. A click on a name hides a method, two show it alone."
     )
+    if n_methods > len(methods):
+        caption += f" The {len(methods)} best by F1 of {n_methods} methods; results.csv has all."
     return [Chart("by_scenario", "Every method on every scenario", Drawing(rows, 190), caption)]
+
+
+def _best(data: RunData, methods: list[str]) -> list[str]:
+    """Return the methods of highest F1 that the chart has room for, in their order."""
+    means = {name: over_pairs(select_rows(data.results, variant=name), "object_f1_50") for name in methods}
+    falling = sorted(methods, key=lambda name: -math.inf if math.isnan(means[name]) else means[name], reverse=True)
+    kept = set(falling[:_MAX_METHODS])
+    return [name for name in methods if name in kept]

@@ -12,15 +12,16 @@ import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
 from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
-from eval.report.comparing.columns import COMPARED, POOLED, figures_of, is_time
+from eval.report.comparing.columns import COMPARED, figures_of, is_time
 from eval.report.merge.tables import name_kinds
+from eval.report.pooled import POOLED, pooled_recalls
 from eval.report.surface.surface import SURFACE_COLUMNS
 from eval.report.tables import Cell, Table, methods_table, written_interval
-from eval.running.results.cases import comparable
+from eval.running.results.cases import comparable, is_unmade
 from eval.running.results.grids import off_grids
 from eval.running.results.run_data import RunData, covered_by, ends_at_merge, shown_variant, stored_table
 from eval.running.results.sides import is_contended
-from eval.running.results.values import Row, number, text
+from eval.running.results.values import text
 from eval.running.runfolder import reported
 from eval.scoring.surface.windows import AREAS_M2
 from eval.tables.columns import Column, fine, select, share, spaced
@@ -94,11 +95,6 @@ def means_by_method(results: pd.DataFrame, columns: Sequence[Column]) -> pd.Data
     return pd.DataFrame(rows)
 
 
-def is_unmade(row: Row) -> bool:
-    """Tell whether a case has no truth: its world could not be made, or its worker died over it."""
-    return text(row, "status") != "ok" and "n_observable" in row and math.isnan(number(row, "n_observable"))
-
-
 def _mean(values: Float64Array, key: str) -> dict[str, float]:
     low, high = bootstrap_interval(values[~np.isnan(values)], statistic_of(key))
     return {key: (median if is_time(key) else mean)(values), f"{key}_low": low, f"{key}_high": high}
@@ -144,11 +140,10 @@ def rank_methods(data: RunData) -> tuple[pd.DataFrame, list[Column], pd.DataFram
     table = means_by_method(figures, HEADLINES)
     if table["domain"].nunique() > 1:  # all pairs together stand in the tables below
         table = table[table["domain"] != ALL_DOMAINS]
-    stored = stored_table(data, "regions_table")
-    if len(stored):
+    pooled = pooled_recalls(data, cases).drop(columns="n_pairs")
+    if len(pooled):
         names = ["domain", "variant"]
-        stored = stored.reindex(columns=[*names, POOLED, f"{POOLED}_low", f"{POOLED}_high"])
-        table = table.drop(columns=stored.columns.difference(names)).merge(stored, on=names, how="left")
+        table = table.drop(columns=pooled.columns.difference(names)).merge(pooled, on=names, how="left")
     shown = [column for column in HEADLINES if table[column.key].notna().any()]
     # higher is better, as written; what is undefined comes last
     ranks = {column.key: -table[column.key].round(2).fillna(-math.inf) for column in shown if column.better == "high"}

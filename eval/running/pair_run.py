@@ -263,8 +263,10 @@ def _describe_method(cell: Cell) -> dict[str, object]:
     merge = cell.config.merge
     asks_kiss_matcher = merge.method == "kiss-matcher" or (merge.method == "voting" and merge.fallback)
     extras = ["kiss-matcher"] if cell.oracle is None and asks_kiss_matcher else []
-    if cell.config.regions.source in PACKAGES and cell.until is None and not cell.oracle_regions:
-        extras.append(PACKAGES[cell.config.regions.source])
+    if cell.until is None:
+        # rivals of the displacement have the names of the sources that use the same package
+        names = [cell.config.regions.source] * (not cell.oracle_regions) + [cell.config.surface.method]
+        extras += dict.fromkeys(PACKAGES[name] for name in names if name in PACKAGES)
     weights = list_checkpoints(cell.config)
     return {
         # the digests name the weights, wherever their files lie

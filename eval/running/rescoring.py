@@ -12,10 +12,11 @@ from cdpipe.core.names import require_table_name, visible
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.running.cell_file import LAST, NO_KEY, cell_document
 from eval.running.cell_rows import IDENTITY
+from eval.running.results.cases import is_unmade
 from eval.running.runfolder import RunFolder, write_json, write_tables
 from eval.running.scaling.keeping import list_dropped
 from eval.running.scaling.remaking import remade_below
-from eval.scoring.scoring import score_stored
+from eval.scoring.scoring import METRICS_VERSION, score_stored
 from eval.truth.ground_truth import load_ground_truth
 
 
@@ -57,11 +58,29 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
             progress.cells("{scenario} {seed} {variant}".format(**identity), len(documents), len(folders))
             score = score_stored(truth, folder, may_end_early=key != NO_KEY)
             documents[path] = cell_document(score, identity, key, place)
+    left = _list_unscored(run, documents)
     for path, document in documents.items():
         write_json(path, document)
     progress.cells("done", len(documents), len(documents))
+    if left:
+        told = f"{len(left)} cells of another metrics version have no answer here, as {left[0]}"
+        progress.note(f"{run.path}: {told}: `run` the plan again with --force, which makes them anew")
     write_tables(run)
     return len(documents)
+
+
+def _list_unscored(run: RunFolder, documents: dict[Path, dict[str, Any]]) -> list[str]:
+    """Return the cells of another metrics version without an answer; of those without a truth the version is raised."""
+    left = []
+    for path in sorted((run.path / "cells").glob("*/*/*.json")):
+        stored = None if path in documents else run.read_cell(path)
+        if stored is None or stored["row"].get("metrics_version") == METRICS_VERSION:
+            continue
+        if is_unmade(stored["row"]):  # a row of no figures
+            documents[path] = {**stored, "row": {**stored["row"], "metrics_version": METRICS_VERSION}}
+        else:
+            left.append(str(path.relative_to(run.path / "cells").with_suffix("")))
+    return left
 
 
 def foreign_identity(run: RunFolder, slug: str, seed: str, name: str) -> dict[str, Any]:

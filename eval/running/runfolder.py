@@ -61,7 +61,7 @@ from eval.tables.surface.table import surface_tables
 
 # What provenance.json says of the run that made the cells; plan, settings and checkpoints are those of the last run.
 _OF_THE_START = ("started", "finished", "command", "machine")
-_OF_THE_MAKING = (*_OF_THE_START, "git_commit", "versions")
+_OF_THE_MAKING = (*_OF_THE_START, "git_commit", "versions", "parts")
 _MAP_CELL_M = 0.1  # pictures number no smaller cells
 _MAPS = {"before_points": ArraySpec("N,3", "float32"), "after_points": ArraySpec("M,3", "float32")}
 
@@ -265,7 +265,7 @@ def keep_makers(now: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str,
 def _lasting(provenance: Mapping[str, Any]) -> dict[str, Any]:
     tables = provenance.get("tables")
     told = {**provenance, **tables} if isinstance(tables, Mapping) else provenance
-    return {name: value for name, value in told.items() if name not in {*_OF_THE_START, "tables"}}
+    return {name: value for name, value in told.items() if name not in {*_OF_THE_START, "tables", "parts"}}
 
 
 def reported(provenance: Mapping[str, Any]) -> tuple[str, ...]:
@@ -282,14 +282,15 @@ def _report_tables(
     tables = {name: pd.DataFrame() for name in (*REGION_FILES, *OBJECT_FILES, *HARD_FILES, *SURFACE_FILES)}
     provenance = run.stored_provenance()
     subjects, targets = reported(provenance), read_targets(provenance)
-    if not subjects or "region_auroc" not in results:
+    plan = read_stored_plan(provenance)
+    has_axes = plan is not None and bool(plan.axes)
+    if not (subjects or has_axes) or "region_auroc" not in results:
         return tables
     cases = zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
     is_whole = measure_coverage(provenance, cases).is_whole
     if "regions" in subjects:
         tables |= region_tables(results, items, targets, is_whole=is_whole)
-    plan = read_stored_plan(provenance)
-    if plan is not None and plan.axes:
+    if plan is not None and has_axes:
         steps = hardness_table(results, items["regions"], items["changes"], plan)
         tables |= dict(zip(HARD_FILES, (steps, breaking_points(steps)), strict=True))
     if "objects" in subjects:

@@ -30,6 +30,7 @@ from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Tools, pair_lock
 from eval.running.run_workers import remove_traces, run_on_workers
 from eval.running.runfolder import RunFolder, current_results, keep_makers, write_json, write_tables
 from eval.running.scaling.keeping import Keep, drop_pair, dropped_file, is_dropped, remove_leftovers
+from eval.running.scaling.merged_provenance import resume_provenance
 from eval.running.scaling.mirror import Mirror
 from eval.running.scaling.remaking import remake_pair
 from eval.running.scaling.shards import Shard, choose_cells, require_same_shard
@@ -104,6 +105,8 @@ def run_plan(
     results = None if n_todo else current_results(run, run.stored_provenance(), provenance)
     if not n_run:
         provenance = keep_makers(provenance, run.stored_provenance())
+    elif n_todo < len(own_cells) and (earlier := run.stored_provenance()):
+        provenance = resume_provenance(str(run.path), earlier, provenance)
     # an unusable cluster is reported before anything is written
     with nullcontext() if where == HERE or not chosen else connected(where, len(chosen)) as client:
         if results is None:

@@ -22,6 +22,7 @@ import typer
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.model.config import load_config
+from cdpipe.training.shard import split_of
 from eval.core.tablefile import read_table as read_stored_table
 from eval.core.tablefile import table_file
 from eval.core.terminal.exits import run_program
@@ -80,8 +81,10 @@ def find_thresholds(results: pd.DataFrame, regions: pd.DataFrame, *, has_wide: b
         `threshold_at_rate`, which at most 0.1 false regions per 100 m reach, with path length `km` and `n_false`.
 
     Raises:
-        InputError: A pair has changes, so that its alarms are not false; or no pair of a kind has an answer.
+        InputError: A seed is not of the validation split; a pair has changes, so that its alarms are not false; or no
+            pair of a kind has an answer.
     """
+    require_validation(results)
     changed = results.loc[results["n_changes"] > 0, "scenario"].unique()
     if len(changed):
         raise InputError(f"{', '.join(changed)}: has changes: calibration needs unchanged pairs")
@@ -174,6 +177,17 @@ def read_table(path: Path, plan: str) -> pd.DataFrame:
     if table.empty:
         raise InputError(f"{path}: has no rows: {expected}")
     return table
+
+
+def require_validation(results: pd.DataFrame) -> None:
+    """Refuse a run that settings may not be chosen on.
+
+    Raises:
+        InputError: A seed is not of the validation split.
+    """
+    others = [seed for seed in results["seed"].unique().tolist() if split_of(int(seed)) != "validation"]
+    if others:
+        raise InputError(f"seed {others[0]}: settings are chosen on seeds 10000 to 19999 alone: run the plan on those")
 
 
 @cache

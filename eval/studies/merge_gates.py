@@ -32,7 +32,7 @@ from eval.core.terminal.printing import echo
 from eval.plans.cells import expand_cells
 from eval.plans.coverage import read_stored_plan
 from eval.running.runfolder import read_json
-from eval.studies.calibrate import read_table
+from eval.studies.calibrate import read_table, require_validation
 from eval.tables.merge_table import RULES, is_accepted, is_right, kinds
 from eval.tables.rows import numbers, texts
 
@@ -212,6 +212,7 @@ def main(
     """Print, write and draw which merges of a validation run each gate accepts and refuses."""
     path = run / "results.csv"
     results = read_table(path, "merge-gates")
+    require_validation(results)
     require_ungated(results, choose_variant(results, variant), read_json(run / "provenance.json"))
     cases, thresholds = tabulate_merges(results, variant), read_committed_thresholds()
     if len(cases) == 0:

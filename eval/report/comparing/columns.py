@@ -8,13 +8,12 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
+from eval.report.pooled import POOLED
 from eval.tables.columns import RESULT_COLUMNS, Column, select, share, significant
 from eval.tables.merge_table import RULES, is_within_target, kinds
 from eval.tables.rows import numbers, with_domain
 from eval.tables.targets import is_unchanged_pair
 
-POOLED = "recall_at_0.1"
-POOLED_RATE_PER_100M = 0.1
 # kinds of pair at which a refusal can be right
 _REFUSABLE = ("smooth", "disjoint")
 _P95 = replace(*select(RESULT_COLUMNS, "merge_error_m"), key="merge_error_m_p95",

@@ -7,8 +7,7 @@ pairs. A verdict needs at least six pairs and an interval that excludes 0.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,10 +15,10 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from eval.core.statistics import ENOUGH_PAIRS, paired_difference
-from eval.report.comparing.columns import COMPARED, POOLED, POOLED_RATE_PER_100M, figures_of, is_time
-from eval.running.results.run_data import RunData
+from eval.report.comparing.columns import COMPARED, figures_of, is_time
+from eval.report.pooled import POOLED, POOLED_RATE_PER_100M, rank_pairs
 from eval.running.results.sides import Side, check_extras, check_versions, matched_variants
-from eval.tables.regions.curves import RankedPairs, ranked_pairs, recall_at, recall_difference
+from eval.tables.regions.curves import recall_at, recall_difference
 from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, numbers
 
 BETTER, WORSE, NOISE = "better", "worse", "no difference beyond noise"
@@ -29,11 +28,6 @@ COLUMNS = (
     "mean_a", "mean_b", "difference", "low", "high", "verdict",
 )  # fmt: skip
 _ORDER = {column.key: place for place, column in enumerate(COMPARED)}
-# columns of results.csv, regions.csv and changes.csv without which no candidate can be ranked
-_NEEDED = (
-    {"n_observable", "score_radius_m", "after_path_m", "status"}, {"score", "found_changes", *PAIR},
-    {"id", "is_observable", "n_truth_cells", *PAIR},
-)  # fmt: skip
 
 
 def compare(a: Side, b: Side, *, times_count: bool = True, seed: int = 0) -> pd.DataFrame:
@@ -145,7 +139,7 @@ def pooled_difference(
         One row as of `paired_differences`, or none where it is undefined.
     """
     wanted = tuple(pairs)
-    first, second = (_ranked(side.data, variant, wanted) for side, variant in zip(sides, variants, strict=True))
+    first, second = (rank_pairs(side.data, variant, wanted) for side, variant in zip(sides, variants, strict=True))
     if first is None or second is None:
         return []
     n_used = int(np.count_nonzero(first.n_observable))
@@ -159,22 +153,6 @@ def pooled_difference(
             "mean_b": recalls[1], "difference": difference, "low": low, "high": high,
         }
     ]  # fmt: skip
-
-
-@lru_cache(maxsize=8)  # one method is compared with all others
-def _ranked(data: RunData, variant: str, pairs: tuple[tuple[str, int], ...]) -> RankedPairs | None:
-    """Return the candidates and changes of one variant on some pairs; None where columns are missing."""
-    tables = [_items(rows, variant, pairs) for rows in (data.results, data.regions, data.changes)]
-    if not all(needed <= set(table) for needed, table in zip(_NEEDED, tables, strict=True)):
-        return None
-    return ranked_pairs(*tables)
-
-
-def _items(rows: Sequence[Mapping[str, Any]], variant: str, pairs: Iterable[tuple[str, int]]) -> pd.DataFrame:
-    """Return the rows of one variant on some pairs, in their order."""
-    wanted = set(pairs)
-    kept = [row for row in rows if row["variant"] == variant and (row["scenario"], row["seed"]) in wanted]
-    return pd.DataFrame(kept)
 
 
 def _place(row: Mapping[str, Any]) -> tuple[bool, int, str]:

@@ -29,7 +29,7 @@ _LARGEST_BYTES, _MOST_PIXELS = 64_000_000, 40_000_000
 _ADDRESS = re.compile(r"data:image/(png|webp);base64,([A-Za-z0-9+/]+=*)")
 _FROM_EARLIER = "From an earlier page of this run, in the colours of then."
 _KEPT = "Sessions and answers are not beside this page: pictures and tables made of them are those of an earlier page."
-_LONE = {"settings": "settings", "results": "results", "unchanged": "unchanged", "table1": "paper", "table2": "paper"}
+_LONE = {"settings": "settings", "table1": "paper", "table2": "paper"}  # the others need results.csv alone
 _TABLED = ("regions", "objects", "surface", "merge")
 
 
@@ -107,9 +107,12 @@ def _titles(content: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _fuller(table: Table, section: str, kept: KeptPage) -> Table:
-    """Return the table of that caption that has more figures."""
-    earlier = kept.tables.get((section, table.caption), table)
-    return earlier if _count_filled(earlier) > _count_filled(table) else table
+    """Return the table of that caption that has more figures; that of the earlier page says that it is."""
+    captions = (table.caption, _noted(table.caption))
+    earlier = next((kept.tables[section, each] for each in captions if (section, each) in kept.tables), table)
+    if _count_filled(earlier) <= _count_filled(table):
+        return table
+    return replace(earlier, caption=_noted(earlier.caption))
 
 
 def _count_filled(table: Table) -> int:
@@ -120,8 +123,11 @@ def _count_filled(table: Table) -> int:
 def _with_tables(part: Section, name: str, kept: KeptPage) -> Section:
     """Return a section with the fuller of its tables, and behind them those that only the earlier page had."""
     tables, cases = (tuple(_fuller(each, name, kept) for each in tables) for tables in (part.tables, part.cases))
-    captions = {each.caption for each in (*tables, *cases)}
-    lost = tuple(each for (key, caption), each in kept.tables.items() if key == name and caption not in captions)
+    captions = {_noted(each.caption) for each in (*tables, *cases)}
+    lost = tuple(
+        replace(each, caption=_noted(caption))
+        for (key, caption), each in kept.tables.items() if key == name and _noted(caption) not in captions
+    )  # fmt: skip
     return replace(part, tables=(*tables, *lost), cases=cases)
 
 

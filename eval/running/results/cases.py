@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pandas as pd
 
 from eval.plans.worlds import find_references, is_other_odometry
 from eval.running.results.grids import grid_points
 from eval.running.results.run_data import RunData
-from eval.running.results.values import Row, flag, select_rows
+from eval.running.results.values import Row, flag, number, select_rows, text
 from eval.tables.rows import with_domain
 
 _PICTURED = ("paper", "tunnelcd", "voxel-diff")
@@ -47,6 +49,11 @@ def is_unchanged(data: RunData, scenario: str) -> bool:
     flags = [flag(row, "is_unchanged_pair") for row in select_rows(data.results, scenario=scenario)]
     known = [value for value in flags if value is not None]
     return bool(known) and all(known)
+
+
+def is_unmade(row: Row) -> bool:
+    """Tell whether a case has no truth: its world could not be made, or its worker died over it."""
+    return text(row, "status") != "ok" and "n_observable" in row and math.isnan(number(row, "n_observable"))
 
 
 def named_variants(data: RunData, scenario: str) -> list[str]:

@@ -30,7 +30,10 @@ class GridOf:
 
 
 def find_grids(data: RunData) -> list[GridOf]:
-    """Find the grids: variants of one preset that set the same keys, two of them to several values, the rest to one."""
+    """Find the grids: variants of one preset that set the same keys, two of them to several values, the rest to one.
+
+    A grid has a variant at each pair of values. Fewer are variants of their own, and stand in the tables.
+    """
     found: dict[tuple[str, str, tuple[str, ...]], dict[str, dict[str, str]]] = {}
     for row in data.results:
         preset, settings = split_variant(str(row["variant"]))
@@ -39,7 +42,7 @@ def find_grids(data: RunData) -> list[GridOf]:
     for (scenario, preset, keys), variants in found.items():
         values = {key: sorted_values({settings[key] for settings in variants.values()}) for key in keys}
         varied = [key for key in keys if len(values[key]) >= 2]
-        if len(varied) == 2:
+        if len(varied) == 2 and len(variants) == len(values[varied[0]]) * len(values[varied[1]]):
             row_key, column_key = varied
             fixed = ", ".join(f"{key}={values[key][0]}" for key in keys if key not in varied)
             points = {(settings[row_key], settings[column_key]): name for name, settings in variants.items()}

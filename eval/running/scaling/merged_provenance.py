@@ -51,8 +51,28 @@ def unite_provenance(
     return united, notes
 
 
-def _require_alike(name: str, first: Mapping[str, Any], other_name: str, other: Mapping[str, Any]) -> None:
-    for key in _MUST_AGREE:
+def resume_provenance(name: str, earlier: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the provenance of a run that keeps cells of an earlier one in its folder.
+
+    On another machine, `machine` and `parts` tell of both, as in united runs.
+
+    Raises:
+        InputError: The packages have other versions, or the numeric libraries other threads.
+    """
+    try:
+        _require_alike("its finished cells", earlier, "the others", now, ("versions",))
+    except InputError as error:
+        raise InputError(f"{name}: {error}; or name a new folder, or add --force, which makes all anew") from error
+    if "parts" not in earlier and earlier.get("machine") == now.get("machine"):
+        return dict(now)
+    machine = _unite_machines([earlier.get("machine"), now.get("machine")])
+    return {**now, "machine": machine, "parts": [*_parts(name, earlier), *_parts(name, now)]}
+
+
+def _require_alike(
+    name: str, first: Mapping[str, Any], other_name: str, other: Mapping[str, Any], keys: Sequence[str] = _MUST_AGREE
+) -> None:
+    for key in keys:
         one, two = (_comparable(key, each) for each in (first, other))
         if one != two:
             raise InputError(

@@ -107,7 +107,7 @@ def _are_rows(rows: Any) -> bool:
 def _key(scenario: Scenario, seed: int, settings: Sequence[str]) -> str:
     config = load_config("tunnelcd", settings)
     # the scores do not depend on these settings of the query, nor on where a file of weights lies
-    unused = {"query": {"threshold", "n_regions", "suppression", "radius_m"}, "descriptor": {"weights"}}
+    unused = {"query": {"threshold", "n_regions", "suppression"}, "descriptor": {"weights"}}
     return digest(
         {
             "version": _VERSION,
@@ -121,6 +121,7 @@ def _key(scenario: Scenario, seed: int, settings: Sequence[str]) -> str:
                 checkpoint_digest(config.descriptor.model_copy(update={"method": method})) for method in METHODS
             ],
             "sphere": sphere_digest(config.sphere),
+            "frames": config.sphere.frames,
         }
     )
 

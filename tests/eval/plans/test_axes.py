@@ -98,6 +98,17 @@ def test_a_step_replaces_a_setting_of_a_variant(tmp_path: Path) -> None:
     assert not any(name.count("keyframe") > 1 for name in names)
 
 
+def test_a_step_and_a_grid_point_go_over_the_settings_of_a_site(tmp_path: Path) -> None:
+    own = "{preset: c2c, per_scenario: {smoke/one_box: [map.keyframe_spacing_m=2, query.n_regions=3]}}"
+    grid = "grid:\n  - {variant: c2c, keys: {map.keyframe_spacing_m: [5], extract.min_points: [4, 5]}}\n"
+    cells = expand_cells(read(tmp_path, PLAN.replace("{preset: c2c}", own) + grid))
+    found = {cell.variant: cell.config for cell in cells if cell.scenario.startswith("smoke/one_box")}
+    assert found["c2c"].map.keyframe_spacing_m == 2
+    assert found["c2c[map.keyframe_spacing_m=4]"].map.keyframe_spacing_m == 4
+    point = found["c2c[map.keyframe_spacing_m=5,extract.min_points=4]"]
+    assert (point.map.keyframe_spacing_m, point.query.n_regions) == (5, 3)
+
+
 def test_plan_hard_asks_for_twelve_axes_with_five_steps_but_one() -> None:
     plan = load_plan("hard")
     assert [len(axis.steps) for axis in plan.axes] == [5, 5, 5, 5, 5, 2, 5, 5, 5, 5, 5, 5]

@@ -92,7 +92,8 @@ def test_a_cost_that_is_stated_for_some_answers_only_does_not_compete(tmp_path: 
 
 def test_recall_at_a_rate_is_taken_from_the_table_of_regions(tmp_path: Path) -> None:
     names = [{"domain": domain, "variant": name} for domain in ("in", "all") for name in ("a", "b")]
-    stored = [{**each, "recall_at_0.1": value, "recall_at_0.1_low": value - 0.1, "recall_at_0.1_high": value + 0.1}
+    stored = [{**each, "n_pairs": 6, "recall_at_0.1": value,
+               "recall_at_0.1_low": value - 0.1, "recall_at_0.1_high": value + 0.1}
               for each, value in zip(names, (0.5, 0.7, 0.0, 0.0), strict=True)]  # fmt: skip
     pd.DataFrame(stored).to_csv(tmp_path / "regions_table.csv", index=False)
     table = pareto_table(run(tmp_path, {"a": (NAN, 1.0, 1.0), "b": (NAN, 2.0, 1.0)}))
@@ -101,6 +102,10 @@ def test_recall_at_a_rate_is_taken_from_the_table_of_regions(tmp_path: Path) -> 
     assert own["quality_value"].tolist() == [0.5, 0.7]
     assert own["high"].tolist() == pytest.approx([0.6, 0.8])
     assert own["is_on_front"].tolist() == [True, True]
+    # a table over other pairs too, as of a world's repetitions, says nothing of these
+    pd.DataFrame(stored).assign(n_pairs=132).to_csv(tmp_path / "regions_table.csv", index=False)
+    table = pareto_table(run(tmp_path, {"a": (NAN, 1.0, 1.0), "b": (NAN, 2.0, 1.0)}))
+    assert "recall_at_0.1" not in set(table["quality"])
 
 
 def test_one_method_is_no_comparison(tmp_path: Path) -> None:

@@ -124,6 +124,14 @@ def test_a_grid_varies_two_settings_and_may_fix_others(tmp_path: Path) -> None:
     assert grid.points["10.0", "1"] == points[2]
 
 
+def test_variants_that_fill_no_grid_are_no_grid(tmp_path: Path) -> None:
+    names = ("p", "p[a.x=1,b.y=1]", "p[a.x=2,b.y=2]", "p[a.x=1,b.y=2]")
+    rows = tuple({"scenario": "s", "seed": 1, "variant": name} for name in names)
+    assert find_grids(RunData(RunFolder(tmp_path), rows, (), (), {}, ())) == []
+    whole = (*rows, {"scenario": "s", "seed": 1, "variant": "p[a.x=2,b.y=1]"})
+    assert len(find_grids(RunData(RunFolder(tmp_path), whole, (), (), {}, ()))) == 1
+
+
 def test_overlay_shows_each_map_in_its_colour_and_equal_areas_alike() -> None:
     image = pixels(overlay_map(square(0, 0), square(6, 1)))
     n_before, n_after = (share_of(image[image.shape[0] // 5 :], colour) for colour in (BLUE, ORANGE))

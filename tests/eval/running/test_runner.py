@@ -97,6 +97,27 @@ def test_stored_maps_are_those_of_the_default_settings(smoke: RunFolder) -> None
             np.testing.assert_array_equal(stored[f"{session}_points"], expected.astype(np.float32))
 
 
+def test_a_run_goes_on_with_the_same_packages_and_names_both_machines(tmp_path: Path, runner: Runner) -> None:
+    plan = plan_of(tmp_path, variants="{preset: random-regions}, {preset: c2c}")
+    run, _ = runner.run(tmp_path / "run", plan, limit=1)
+    told = run.provenance()
+    for versions, threads in (
+        ({**told["versions"], "numpy": "1.0"}, told["machine"]["threads"]),
+        (told["versions"], 63),
+    ):
+        machine = {**told["machine"], "threads": threads}
+        write_json(run.path / "provenance.json", {**told, "versions": versions, "machine": machine})
+        with pytest.raises(InputError, match=r"its finished cells and the others: of different .*or add --force"):
+            runner.run(tmp_path / "run", plan)
+    write_json(run.path / "provenance.json", {**told, "machine": {**told["machine"], "cpu": "another"}})
+    runner.run(tmp_path / "run", plan)
+    found = run.provenance()
+    assert found["machine"]["cpu"] == f"another and {told['machine']['cpu']}"
+    assert [part["machine"]["cpu"] for part in found["parts"]] == ["another", told["machine"]["cpu"]]
+    assert runner.run(tmp_path / "run", plan)[1].n_done == 0
+    assert run.provenance()["parts"] == found["parts"]
+
+
 def test_provenance_says_what_made_the_results(smoke: RunFolder) -> None:
     document = smoke.provenance()
     assert document["command"] == "tunnelcd run 'a b'"

@@ -49,7 +49,7 @@ def test_half_a_kilometre_allows_five_tenths_of_a_false_region_and_so_none() -> 
 
 def _results(n_changes: int = 0, preset: str = "c2c") -> pd.DataFrame:
     rows = [
-        (scenario, seed, "m", preset, "ok" if seed else "merge_refused", n_changes, radius_m, 1000.0)
+        (scenario, 10_000 + seed, "m", preset, "ok" if seed else "merge_refused", n_changes, radius_m, 1000.0)
         for scenario, radius_m in (("null/a", 4.5), ("null/b", 4.5), ("null/c", 10.0))
         for seed in range(4)
     ]
@@ -59,7 +59,7 @@ def _results(n_changes: int = 0, preset: str = "c2c") -> pd.DataFrame:
 
 def _regions() -> pd.DataFrame:
     found = [("null/a", 1, 5.0), ("null/a", 1, 4.0), ("null/a", 2, 3.0), ("null/b", 3, 6.0), ("null/c", 1, 200.0)]
-    rows = [(scenario, seed, "m", score, score >= 4.0, False) for scenario, seed, score in found]
+    rows = [(scenario, 10_000 + seed, "m", score, score >= 4.0, False) for scenario, seed, score in found]
     return pd.DataFrame(rows, columns=["scenario", "seed", "variant", "score", "is_reported", "is_withdrawn"])
 
 
@@ -136,6 +136,13 @@ def test_the_settings_are_lines_of_a_preset(tmp_path: Path) -> None:
 def test_changed_pairs_are_refused() -> None:
     with pytest.raises(InputError, match="null/a, null/b, null/c: "):
         find_thresholds(_results(n_changes=1), pd.DataFrame(columns=["scenario", "seed", "variant", "score"]))
+
+
+def test_only_validation_seeds_are_calibrated_on() -> None:
+    results = _results()
+    results.loc[3, "seed"] = 20_000
+    with pytest.raises(InputError, match="seed 20000: settings are chosen on seeds 10000 to 19999 alone"):
+        find_thresholds(results, _regions())
 
 
 def test_a_kind_of_site_without_an_answer_gives_no_threshold() -> None:

@@ -59,7 +59,7 @@ def table_of(cases: tuple[tuple[str, float, dict[str, float]], ...] = CASES) -> 
                 "merge_error_deg": metres,
                 **{f"evidence_{name}": value for name, value in (GOOD | other).items()},
             }
-            for seed, (kind, metres, other) in enumerate(cases)
+            for seed, (kind, metres, other) in enumerate(cases, 10_000)
         ]
     )
 
@@ -192,7 +192,7 @@ def test_merges_that_a_gate_has_sifted_are_refused() -> None:
     results.loc[1, ["status", "error"]] = ["merge_refused", "too few points"]
     require_ungated(results, UNGATED, provenance("merge.accept_all=true"))
     results.loc[2, ["status", "error"]] = ["merge_refused", "it can slide; merge.min_hessian_ratio asks for 0.01"]
-    with pytest.raises(InputError, match=r"merge/drift, seed 2: refused by merge.min_hessian_ratio"):
+    with pytest.raises(InputError, match=r"merge/drift, seed 10002: refused by merge.min_hessian_ratio"):
         require_ungated(results, UNGATED, provenance("merge.accept_all=true"))
 
 
