@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from difflib import get_close_matches
 from itertools import pairwise
 from typing import Any
 
@@ -22,12 +23,14 @@ _NO_DRIFT = "no drift joins"
 def find_dangling(tree: Any) -> list[Mistake]:
     """Return every dangling reference of a drawn scenario as (key path, rule).
 
-    Where the tunnel has no nodes, as under a misspelt key, the schema says so, and no reference to one is told.
+    Where the nodes stand under a misspelt key, or are no mapping, the schema says so, and no reference to one is told.
     """
     tunnel = mapping_at(tree, "tunnel")
     nodes = [str(name) for name in mapping_at(tunnel, "nodes")]
     elsewhere = [*_repeated_names(tree), *_area_mistakes(tree)]
-    if not nodes:
+    others = [str(key) for key in tunnel if key != "nodes"]
+    is_misspelt = not tunnel or tunnel.get("nodes", {}) != {} or bool(get_close_matches("nodes", others, cutoff=0.75))
+    if not nodes and is_misspelt:
         return elsewhere
     edges = {
         frozenset(pair)

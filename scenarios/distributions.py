@@ -7,7 +7,7 @@ named by its `name`, or by its index if it has none. So no draw depends on any o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Any
@@ -67,10 +67,23 @@ def is_distribution(tree: Any) -> bool:
 
 
 def merge_trees(base: Any, over: Any) -> Any:
-    """Return `base` overwritten by `over`: mappings key by key, lists and distributions as a whole."""
+    """Return `base` overwritten by `over`: mappings key by key, lists and distributions as a whole.
+
+    What the options of a `one_of` in `over` give is left out of `base`: it would win over them.
+    """
     if not (isinstance(base, dict) and isinstance(over, dict)) or is_distribution(base) or is_distribution(over):
         return over
-    return {**base, **{key: merge_trees(base[key], item) if key in base else item for key, item in over.items()}}
+    drawn = option_keys(over)
+    kept = {key: item for key, item in base.items() if key not in drawn}
+    return {**kept, **{key: merge_trees(kept[key], item) if key in kept else item for key, item in over.items()}}
+
+
+def option_keys(tree: Mapping[Any, Any]) -> set[Any]:
+    """Return the keys that the options of a mapping's `one_of` give, less those that stand beside it."""
+    options = tree.get("one_of")
+    if not isinstance(options, list):
+        return set()
+    return {key for option in options if isinstance(option, dict) for key in option} - set(tree)
 
 
 def join_key(key: Key) -> str:

@@ -17,7 +17,7 @@ from cdpipe.core.names import visible
 from cdpipe.core.yamlfile import Document, apply_settings, read_yaml, suggest, validate
 from scenarios.catalogue import family_files, family_of, prop_files, prop_names, read_prop
 from scenarios.dangling import Mistake, find_dangling, items_at, mapping_at
-from scenarios.distributions import draw, find_malformed, is_distribution, join_key, merge_trees
+from scenarios.distributions import draw, find_malformed, is_distribution, join_key, merge_trees, option_keys
 from scenarios.grafted import GraftScenario, take_props
 from scenarios.references import file_keys, find_contradictions
 from scenarios.schema import PROP_KINDS, Prop, Scenario, source_of
@@ -332,6 +332,6 @@ def _is_replaced(key: Key, base: Any, over: Any) -> bool:
         if not both or is_distribution(base) or is_distribution(over):
             return True
         if part not in over:
-            return False
+            return part in option_keys(over)
         base, over = base[part], over[part]
     return False

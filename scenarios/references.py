@@ -158,6 +158,8 @@ def _foreign_mistakes(scenario: Scenario) -> Iterator[Mistake]:
         yield ("tunnel", "furniture"), "hangs along drifts: give tunnel.drifts that run through tunnel.mesh"
     if tunnel.floor.stones is not None:
         yield ("tunnel", "floor", "stones"), "lie along drifts: give tunnel.drifts that run through tunnel.mesh"
+    if scenario.surface:
+        yield ("surface",), "rock changes along drifts: give tunnel.drifts that run through tunnel.mesh"
 
 
 def _undrawable(scenario: Scenario) -> Iterator[Mistake]:

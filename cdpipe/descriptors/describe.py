@@ -44,6 +44,7 @@ _FILE = {
     "odom_T_sensor": ArraySpec("S,4,4", "float64"),
     "spheres": ArraySpec("K,F", "float32 int8", is_optional=True),
     "spheres_of": ArraySpec("", "str", is_optional=True),
+    "airborne": ArraySpec("", "str", is_optional=True),  # `map.airborne` of the scans; "keep" where it is left out
 }
 
 
@@ -117,6 +118,8 @@ def save_descriptors(
     optional: dict[str, npt.NDArray[Any]] = {} if descriptors.w is None else {"w": descriptors.w}
     if descriptors.spheres is not None:
         optional |= {"spheres": descriptors.spheres, "spheres_of": np.array(_spheres_of(map_config, sphere))}
+    if map_config.airborne != "keep":
+        optional["airborne"] = np.array(map_config.airborne)
     try:
         if path.parent.is_symlink():
             raise InputError(f"{path.parent}: is a link, and nothing outside of {folder} may be written: remove it")
@@ -146,7 +149,7 @@ def load_descriptors(
     map_config: MapConfig,
     sphere: SphereConfig = _SHIPPED,
 ) -> DescriptorSet | None:
-    """Read stored descriptors; None if there are none for these weights and these poses.
+    """Read stored descriptors; None if there are none for these weights, these poses and this rule for dust.
 
     Sphere descriptors are included if they are for these weights, this precision and these map settings.
 
@@ -159,7 +162,8 @@ def load_descriptors(
     arrays = read_npz(path, _FILE, remedy="remove it and describe the session again")
     checkpoint = str(arrays["checkpoint"])
     is_of_session = np.array_equal(arrays["odom_T_sensor"], odom_T_sensor)
-    if not is_of_session or checkpoint != checkpoint_digest(config):
+    is_of_air = str(arrays.get("airborne", "keep")) == map_config.airborne
+    if not (is_of_session and is_of_air) or checkpoint != checkpoint_digest(config):
         return None
     spheres = arrays.get("spheres")
     if spheres is not None:

@@ -144,7 +144,9 @@ class Sight:
             return True
         is_near = at_keyframes_m <= _PASS_M
         n_through, n_hit = looks.n_through[is_near].sum(), looks.n_hit[is_near].sum()
-        is_seldom = len(self._seen) < _SELDOM * np.count_nonzero(self._off_m <= _PASS_M)
+        # weighted by path length, as in `is_double`
+        way_m = np.diff(self._path_m, prepend=0.0)
+        is_seldom = way_m[self._seen].sum() < _SELDOM * way_m[self._off_m <= _PASS_M].sum()
         return bool(n_through > (_SELDOM_ON_ITS_WAY if is_seldom else _ON_ITS_WAY) * n_hit)
 
     def is_person(self) -> bool:

@@ -45,7 +45,7 @@ def upright_box(points: Float64Array) -> tuple[Float64Array, Float64Array]:
 def column_volume_m3(
     points_map: Float64Array, other_map: Float64Array, column_m: float = 0.1, ground_m: float = 0.2
 ) -> float:
-    """Return the volume between an object and the ground; 0 without a footprint.
+    """Return the volume between an object and the ground, or the roof that it hangs from; 0 without a footprint.
 
     Args:
         points_map: (P, 3) points of the object, map frame, metres; P is at least 1.
@@ -55,6 +55,9 @@ def column_volume_m3(
         ground_m: Column width of the ground, metres.
     """
     columns = _columns(points_map, column_m)
+    if np.median(ground_heights(other_map, columns, ground_m) - columns[:, 2]) > 0:  # upside down
+        points_map, other_map = points_map * _UPSIDE_DOWN, other_map * _UPSIDE_DOWN
+        columns = _columns(points_map, column_m)
     heights = np.maximum(columns[:, 2] - ground_heights(other_map, columns, ground_m), 0.0)
     try:
         triangles = Delaunay(columns[:, :2]).simplices
@@ -79,6 +82,9 @@ def ground_heights(surface: Float64Array, places: Float64Array, ground_m: float 
     n_columns = min(_GROUND_COLUMNS, len(lowest))
     _, nearest = cKDTree(lowest[:, :2]).query(places[:, :2], k=[*range(1, n_columns + 1)])
     return np.asarray(np.median(lowest[nearest, 2], axis=1))
+
+
+_UPSIDE_DOWN = np.array([1.0, 1.0, -1.0])
 
 
 def _columns(points: Float64Array, column_m: float) -> Float64Array:

@@ -31,6 +31,8 @@ _BLIND_YAWS_RAD = np.array([0.0, np.pi, np.pi / 2, -np.pi / 2])
 # Tolerance of the distance between two pairs: keyframes of one place are up to 2 m apart; drift grows with distance.
 _APART_M = 2.0
 _APART_SHARE = 0.02
+# Heights may differ by this share of the distance: 4 degrees of pitch between two odometries.
+_RISE_SHARE = 0.07
 _YAW_RAD = np.deg2rad(20.0)
 # Motions closer than this converge to the same registration.
 _SAME_M = 3.0
@@ -160,6 +162,10 @@ def count_votes(
     miss_y = before_y - (sines[one] * after_x + cosines[one] * after_y)
     tolerance_m = _APART_M + (_APART_SHARE + np.sin(_YAW_RAD)) * apart_m
     is_agreed = miss_x**2 + miss_y**2 < tolerance_m**2
+    # the turns of a decline and the levels of a mine lie above one another
+    before_z, after_z = before_poses[:, 2, 3], after_poses[:, 2, 3]
+    miss_z = (before_z[other] - before_z[one]) - (after_z[other] - after_z[one])
+    is_agreed &= np.abs(miss_z) < _APART_M + _RISE_SHARE * apart_m
     one, other, apart_m = one[is_agreed], other[is_agreed], apart_m[is_agreed]
     agrees = np.zeros((len(yaws_rad),) * 2, dtype=np.bool_)
     agrees[one, other] = True

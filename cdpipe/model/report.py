@@ -322,8 +322,13 @@ def _tabulate_surface(surface: SurfaceField | None) -> pd.DataFrame:
     for number, (start_m, which) in enumerate(cells.tolist()):
         own = np.flatnonzero(cell.reshape(-1) == number)
         largest = own[np.argmax(np.abs(values_m[own]))]
-        measured = values_m[own].mean(), values_m[largest], np.median(levels_m[own])
-        beyond, in_regions = (np.abs(values_m[own]) > levels_m[own]).mean(), (surface.region[known[own]] >= 0).sum()
+        sure = own[np.isfinite(levels_m[own])]  # a place without a level tells of no share
+        level_m = np.median(levels_m[sure]) if len(sure) else np.nan
+        beyond = (np.abs(values_m[sure]) > levels_m[sure]).mean() if len(sure) else np.nan
+        measured, in_regions = (
+            (values_m[own].mean(), values_m[largest], level_m),
+            (surface.region[known[own]] >= 0).sum(),
+        )
         rows.append((start_m, start_m + 1, _SECTORS[which], len(own), *measured, beyond, in_regions))
     return pd.DataFrame(rows, columns=_SURFACE_COLUMNS)
 

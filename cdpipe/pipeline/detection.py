@@ -140,7 +140,7 @@ def detect_changes(
         if config.surface.method != "none":
             hooks.on_stage("surface", 0, 1)
             surface, is_rock, seconds = measure_surface(merged, report.objects, config)
-            report = replace(leave_out_rock(report, is_rock), surface=surface)
+            report = replace(leave_out_rock(report, is_rock, config.extract), surface=surface)
             report = replace(report, seconds={**report.seconds, "t_surface_s": seconds})
         return Done(report, report.seconds)
 

@@ -46,6 +46,7 @@ def describe(
     if config.regions.source == "sphere":
         descriptors = map_session(source, config).descriptors
     else:
+        check_session(source, config.map)
         chosen = choose_keyframes(source.odom_T_sensor, config.map.keyframe_spacing_m)
         descriptors = describe_scans(clear_air(source, config.map), chosen, config.descriptor)
     return descriptors, save_descriptors(folder, descriptors, source.odom_T_sensor, config.map, config.sphere)

@@ -63,11 +63,15 @@ def find_regions(
         case "sphere":
             # a sphere descriptor covers 2 m of tunnel before and behind its keyframe
             scores = change_log_odds(merged, described, places.is_covered(session), config.sphere, session)
+            sure = scores.copy()
+            if query.n_regions is None:
+                ends = _find_ends(places.of(session), places.of("after" if session == "before" else "before"), query)
+                scores[ends] = np.fmax(scores[ends], query.threshold)
             keyframe_scores = _score_surroundings(
                 places,
                 session,
                 score_radii(merged.before, before.keyframe_scans, query),
-                lambda near, away_m: np.minimum(scores[near], _SURE) - _FALL_PER_M * away_m,
+                lambda near, away_m: np.minimum(sure[near], _SURE) - _FALL_PER_M * away_m,
             )
         case "sphere-difference":
             scores = sphere_difference(merged, before, after, query, session)
@@ -81,6 +85,19 @@ def find_regions(
     return rank_regions(
         places.of(session), scores, places.pairs(session), keyframe_scores, query, direction, radii_m=radii_m
     )
+
+
+def _find_ends(positions: Float64Array, others: Float64Array, config: QueryConfig) -> Int64Array:
+    """Return which of (K, 3) keyframes, their first or last, lie at the first or last of (L, 3) of the other session.
+
+    There both turned back, before a face for example. A sphere descriptor sees 2 m beyond such a keyframe, its region
+    reaches farther, and no other keyframe does. So it is always looked at.
+    """
+    if not len(positions) or not len(others):
+        return np.zeros(0, dtype=np.int64)
+    outer = np.unique([0, len(positions) - 1])
+    apart_m = np.linalg.norm(positions[outer, None] - others[[0, -1]], axis=2).min(axis=1)
+    return outer[apart_m <= config.max_pair_m]
 
 
 def score_keyframes_by_share(

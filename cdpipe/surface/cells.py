@@ -159,7 +159,8 @@ def make_cells(returns: NearReturns, *, with_folds: bool = True) -> SurfaceCells
     """
     n, n_folds = int(returns.cell_of.max(initial=-1)) + 1, N_FOLDS if with_folds else 1
     group = returns.cell_of * n_folds
-    group += np.floor(returns.path_m / _FOLD_M).astype(np.int64) % n_folds
+    # numbered where there are returns: stations of a survey at multiples of all folds would else share one
+    group += np.unique(np.floor(returns.path_m / _FOLD_M), return_inverse=True)[1].reshape(-1) % n_folds
     counts = np.bincount(returns.cell_of, returns.counts, n)
     is_thinned = np.count_nonzero(counts > 1) < _THINNED * n
     kept = np.flatnonzero(counts >= (1 if is_thinned else _LEAST_RETURNS))

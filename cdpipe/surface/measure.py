@@ -79,7 +79,7 @@ def measure_surface(
     chainage_m, angle_deg, _ = unroll(places.points, path)
     after = near_returns(merged, "after")
     measured = load_method(settings.method)(cells, after, places, chainage_m, config)
-    is_rock, is_of_object = split_rock(objects, places, measured.along_m)
+    is_rock, is_of_object = split_rock(objects, places, measured.along_m, measured.level_m)
     along_m, displacement_m = (
         np.where(is_of_object, np.nan, values) for values in (measured.along_m, measured.displacement_m)
     )

@@ -118,6 +118,8 @@ def fit_motions(
         if used.stop - used.start < _LEAST_OFFSETS:
             return np.zeros(3), np.zeros(6), np.full((6, 6), np.nan)
         share = np.maximum(1 - ((path_m[used] - station_m) / window_m) ** 2, 0.0)
+        if np.count_nonzero(share) < _LEAST_OFFSETS:  # those of a sensor that stood lie at one end of the window
+            return np.zeros(3), np.zeros(6), np.full((6, 6), np.nan)
         centre = points[used].mean(axis=0)
         jacobian = plane_jacobian(points[used] - centre, normals[used])
         return centre, *_fit_best(jacobian, along_m[used], share, points[used], noise_m)

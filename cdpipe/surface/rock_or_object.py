@@ -14,6 +14,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
+from cdpipe.extract.extract import FIGURES
+from cdpipe.model.config import ExtractConfig
 from cdpipe.model.report import ChangedObject, ChangeReport
 from cdpipe.surface.places import SurfacePlaces
 
@@ -24,8 +26,9 @@ _AROUND_M, _STILL_M, _LEAST_AROUND = 0.7, 0.03, 5
 # Rock was flush if it stood out by less than this share of the depth that is missing now.
 _FLUSH = 0.4
 _LEAST_DEPTH_M = 0.05
-# Rubble lies no farther than this from below the place that it fell from; that place has so many places at least.
-_BELOW_M, _LEAST_FALLEN = 1.0, 4
+# Rubble lies no farther than this from below the place that it fell from, no deeper than the last, and that place has
+# so many places at least.
+_BELOW_M, _LEAST_FALLEN, _ROOF_M = 1.0, 4, 10.0
 _HIGH_SHARE = 90
 # Floor that heaved, sank or was filled covers at least the first area. Its displacement, over places this far apart in
 # plan, rises by less than this per metre nearly everywhere, and over more than the second area, that of the largest
@@ -36,7 +39,7 @@ _RAMP_M = 0.5
 
 
 def split_rock(
-    objects: Sequence[ChangedObject], places: SurfacePlaces, along_m: Float64Array
+    objects: Sequence[ChangedObject], places: SurfacePlaces, along_m: Float64Array, level_m: Float64Array
 ) -> tuple[BoolArray, BoolArray]:
     """Tell rock from objects.
 
@@ -44,6 +47,7 @@ def split_rock(
         objects: What the extraction cut out, map frame.
         places: Where displacement was measured.
         along_m: (Q,) displacement along the normal, NaN where there is none.
+        level_m: (Q,) its level of detection, NaN where it is not known: only rock that surely fell explains an object.
 
     Returns:
         (O,) whether each object is rock, and (Q,) whether the displacement of a place is that of an object that is not.
@@ -60,7 +64,8 @@ def split_rock(
         if item.session == "before":
             is_rock[number] = _was_flush(places, along_m, own, still) or _is_floor(places, along_m, own)
             is_of_object[own] |= not is_rock[number]
-    fallen = np.flatnonzero((along_m < -_LEAST_DEPTH_M) & ~is_of_object)
+    least_m = np.fmax(np.where(np.isfinite(level_m), level_m, np.inf), _LEAST_DEPTH_M)
+    fallen = np.flatnonzero((along_m < -least_m) & ~is_of_object)
     for number, (item, own) in enumerate(zip(objects, members, strict=True)):
         if item.session == "after":
             is_floor = _is_floor(places, along_m, own)
@@ -69,8 +74,11 @@ def split_rock(
     return is_rock, is_of_object
 
 
-def leave_out_rock(report: ChangeReport, is_rock: BoolArray) -> ChangeReport:
-    """Return a report without the objects that are rock; a region whose objects are all rock is withdrawn."""
+def leave_out_rock(report: ChangeReport, is_rock: BoolArray, config: ExtractConfig) -> ChangeReport:
+    """Return a report without the objects that are rock; a region whose objects are all rock is withdrawn.
+
+    Where regions are never withdrawn, they stay.
+    """
     if not is_rock.any():
         return report
     kept = np.flatnonzero(~is_rock)
@@ -80,9 +88,12 @@ def leave_out_rock(report: ChangeReport, is_rock: BoolArray) -> ChangeReport:
     held = {item.region for item in report.objects} - {item.region for item in objects}
     regions = report.regions
     is_lost = np.isin(np.arange(len(regions.scores)), list(held)) & regions.is_reported
+    is_lost &= config.withdraw and config.method != "clusters"
     is_withdrawn = is_lost if regions.is_withdrawn is None else regions.is_withdrawn | is_lost
     regions = replace(regions, is_reported=regions.is_reported & ~is_lost, is_withdrawn=is_withdrawn)
-    return replace(report, objects=objects, regions=regions)
+    blank = {name: np.where(is_lost, np.nan, report.figures[name]) for name in FIGURES if name in report.figures}
+    figures = {**report.figures, **blank}
+    return replace(report, objects=objects, regions=regions, figures=figures)
 
 
 def _pair_anew(item: ChangedObject, partner: int) -> ChangedObject:
@@ -135,5 +146,6 @@ def _is_below(points: Float64Array, fallen: Float64Array) -> bool:
     if len(fallen) < _LEAST_FALLEN or len(points) == 0:
         return False
     found = cKDTree(points[:, :2]).query(fallen[:, :2], distance_upper_bound=_BELOW_M)
-    is_above = np.isfinite(found[0]) & (fallen[:, 2] > points[:, 2].max())
+    top_m = float(points[:, 2].max())
+    is_above = np.isfinite(found[0]) & (fallen[:, 2] > top_m) & (fallen[:, 2] < top_m + _ROOF_M)
     return int(np.count_nonzero(is_above)) >= _LEAST_FALLEN

@@ -48,7 +48,7 @@ class SurfaceChange(Settings):
     name: str
     kind: SurfaceKind
     place: SurfacePlace = SurfacePlace()
-    depth_m: Annotated[float, Field(gt=0, le=2)] | None = None  # largest, of convergence, heave, scar
+    depth_m: Annotated[float, Field(gt=0, le=2)] | None = None  # largest; a scar reaches 1.7 of it
     thickness_m: Annotated[float, Field(gt=0, le=0.3)] | None = None  # of shotcrete
     height_m: Annotated[float, Field(gt=0, le=3)] | None = None  # of fill above the floor
     advance_m: Annotated[float, Field(gt=0, le=4.5)] | None = None  # of a face

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -92,7 +92,7 @@ def pile_up(walls: TwinWalls, heap: Heap, zone: Zone, change: SurfaceChange, vol
         ScenarioError: The place has no room for so much rubble.
     """
     generator = stream(seed, "surface", change.name, "rubble")
-    outline_key, *_ = generator.integers(2**63, size=2).tolist()
+    outline_key, _ = generator.integers(2**63, size=2).tolist()  # one more is drawn: heaps keep their bytes
     steep = float(np.tan(np.deg2rad(REPOSE_DEG)))
 
     def edge_m(places: Float64Array) -> Float64Array:
@@ -244,9 +244,3 @@ def raise_to(places: Float64Array, level: Float64Array) -> Float64Array:
     raised = places.copy()
     raised[:, 2] = level - _SQUEEZED * (level - places[:, 2])
     return raised
-
-
-def without(moved: Moved, vertices: Int64Array) -> Moved:
-    """Return a move that leaves some vertices where they are."""
-    keep = ~np.isin(moved.vertices, vertices)
-    return replace(moved, vertices=moved.vertices[keep], places=moved.places[keep])

@@ -238,6 +238,11 @@ def _at_end(scenario: Scenario, centreline: Centreline, change: SurfaceChange, n
                 # the zone of fill reaches from its front to behind the face
                 length_m = float(change.length_m or 1.0)
                 stations_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line.points, axis=0), axis=1))])
+                if length_m >= stations_m[-1]:
+                    raise ScenarioError(
+                        f"surface {change.name!r}: length_m = {length_m:g}: its drift is {stations_m[-1]:.1f} m long "
+                        f"{where}: give a shorter one"
+                    )
                 middle_m = stations_m[last] + (length_m / 2 if end == 0 else -length_m / 2)
                 return Zone(line, int(np.argmin(np.abs(stations_m - middle_m))), length_m, where)
     raise ScenarioError(f"surface {change.name!r}: {node!r} is no blind end of a drift")

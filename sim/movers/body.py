@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, make_pose
 from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import model_meshes
@@ -126,13 +127,19 @@ def compile_links(links: Sequence[Link]) -> list[list[Mesh]]:
     """Return the surfaces of every link as MuJoCo compiles them, one mesh per solid, link frame.
 
     Each link is a mocap body of one model, at the identity. Its poses over time are those of `Body.place_links`.
+
+    Raises:
+        ScenarioError: A part has no size.
     """
     spec = mujoco.MjSpec()
     for link in links:
         body = spec.worldbody.add_body(name=link.name, mocap=True)
         for index, solid in enumerate(link.solids):
             add_solid(spec, body, solid, f"{link.name}/{index}", contype=0, conaffinity=0)
-    model = spec.compile()
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise ScenarioError(f"a mover is too small for its parts: {error}: give a larger size_m") from error
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     meshes = iter(model_meshes(model, data))

@@ -23,6 +23,7 @@ from sim.props.shapes import BELOW_FLOOR_M, Shape, Size, shape_mesh, visible_par
 _MOST_FRAGMENTS = 900
 _COVERAGE = 1.5
 _MOST_LOOSE = 14
+_MOST_DRAWS = 2_000
 # Loose blocks lie where the bed would be this far below the floor: up to half a metre from the foot.
 _BESIDE_M = (-0.35, -0.05)
 # Where the middle of a fragment lies along the surface's normal, in its sizes: from nearly buried to nearly free.
@@ -140,12 +141,20 @@ def _places(
     n: int,
     generator: np.random.Generator,
 ) -> Float64Array:
-    """Draw places (n, 2) inside a box where the height of the bed lies in a range."""
+    """Draw places (n, 2) inside a box where the height of the bed lies in a range.
+
+    Raises:
+        ValueError: There is hardly such a place.
+    """
     found = np.empty((0, 2))
-    while len(found) < n:
+    for _ in range(_MOST_DRAWS):
+        if len(found) >= n:
+            break
         drawn = generator.uniform(low[:2], high[:2], (512, 2))
         heights = bed.heights(drawn)
         found = np.concatenate([found, drawn[(heights > range_m[0]) & (heights < range_m[1])]])
+    if len(found) < n:
+        raise ValueError("it has no room for its blocks")
     return found[:n]
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import make_pose, stream
 from scenarios.schema import Prop
 from sim.geometry.mesh import move_mesh
@@ -20,6 +21,8 @@ from sim.rock.foreign import prop_mesh
 
 _ROCK_SUBDIVISIONS = 2
 _CARDBOARD_M = 0.75  # larger boxes are of steel
+_USED = {"box": 3, "cylinder": 2, "mesh": 0}  # how many of the sizes of a solid say something
+_THINNEST_M = 2e-4  # half of the thinnest part: MuJoCo gives no inertia to what is thinner
 BUILDERS = {
     "crate": storage.crate,
     "barrel": storage.barrel,
@@ -42,8 +45,23 @@ def shape_of(prop: Prop, seed: int, *, is_banked: bool = False, loaded_share: fl
         loaded_share: Share of a muck pile's volume that has been removed; None for a whole pile.
 
     Raises:
-        ScenarioError: The file of a mesh cannot be used.
+        ScenarioError: The file of a mesh cannot be used, or the size leaves no room for a part.
     """
+    try:
+        with np.errstate(divide="ignore", invalid="ignore"):  # a part without a length is refused below
+            shape = _build(prop, seed, is_banked=is_banked, loaded_share=loaded_share)
+    except ValueError as error:
+        raise ScenarioError(f"{_told(prop)}: cannot be built: {error}") from error
+    if any(min(solid.size_m[: _USED[solid.kind]], default=1.0) < _THINNEST_M for solid in shape.solids):
+        raise ScenarioError(f"{_told(prop)}: leaves no room for its parts: make it larger")
+    return shape
+
+
+def _told(prop: Prop) -> str:
+    return f"props.{prop.name}.size_m = {list(prop.size_m or ())}"
+
+
+def _build(prop: Prop, seed: int, *, is_banked: bool, loaded_share: float | None) -> Shape:
     if prop.mesh is not None:
         mesh = prop_mesh(prop.mesh, prop.name)
         size = np.ptp(mesh.vertices, axis=0)

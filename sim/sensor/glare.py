@@ -56,7 +56,7 @@ def add_glare(
         is_reflector: (G,) whether each geom is a retroreflector.
         draw: (W, H) uniform numbers that decide which outshone beams report something.
     """
-    is_source = (echo.geom >= 0) & is_reflector[echo.geom] & (echo.photons > 0)
+    is_source = (echo.geom >= 0) & is_reflector[np.maximum(echo.geom, 0)] & (echo.photons > 0)
     if not is_source.any():
         return echo, second
     stray = _spread_light(echo, is_source, rays, sensor)

@@ -8,6 +8,7 @@ from copy import copy
 from dataclasses import replace
 
 from cdpipe.core.errors import ScenarioError
+from cdpipe.core.geometry import Float64Array
 from scenarios.references import file_digests
 from scenarios.schema import Scenario, SessionPlan
 from sim.scene import World, build_world
@@ -15,6 +16,7 @@ from sim.session.labels import Returns, Tally
 from sim.session.planning import make_drive, plan_drives_in
 from sim.session.revolution import Drive
 from sim.session.simulate import HeldPair, collect_truth, hold_session
+from sim.story.curtains import refuse_moved_curtains
 from sim.story.world import plan_alone
 
 
@@ -32,7 +34,8 @@ def simulate_afters(scenario: Scenario, plans: Sequence[SessionPlan], seed: int)
 
     Raises:
         InputError: The sensor profile or another file cannot be read.
-        ScenarioError: The world contradicts itself, a drive finds no way, or rock changes in the scenario.
+        ScenarioError: The world contradicts itself, a drive finds no way, rock changes in the scenario, or a curtain
+            would hang elsewhere in one of the sessions.
     """
     if scenario.surface and plans:
         raise ScenarioError("surface: where rock changes, one after session is simulated: leave out `--afters`")
@@ -41,6 +44,9 @@ def simulate_afters(scenario: Scenario, plans: Sequence[SessionPlan], seed: int)
     further = [
         _plan_after(world, scenario, plan, (seed, number), before.tallies) for number, plan in enumerate(plans, start=2)
     ]
+    curtains: dict[str, Float64Array] = {}
+    for drive in (before, after, *(drive for _, drive in further)):
+        refuse_moved_curtains(drive.name, drive.moving.movers, curtains)
     with ThreadPoolExecutor(1) as pool:
         held = hold_session(before, pool)
         seen = [_copy_tally(tally) for tally in before.tallies]

@@ -9,8 +9,6 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
 
-import numpy as np
-
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.core.plugins import require_extra
@@ -20,6 +18,7 @@ from scenarios.schema import Scenario
 from sim.scene import lay_ground
 from sim.session.planning import PlannedSession, make_drive
 from sim.session.simulate import THREADS, write_session
+from sim.story.curtains import refuse_moved_curtains
 from sim.story.schedule import draw_states
 from sim.story.state import FEWEST, MOST, Story, dump_story
 from sim.story.world import build_session_world, plan_session
@@ -60,7 +59,7 @@ def simulate_story(
             for state in states:
                 world = build_session_world(scenario, ground, state)
                 planned = plan_session(scenario, ground, world, state, seed)
-                _refuse_moved_curtains(planned, curtains)
+                refuse_moved_curtains(planned.own_name, planned.movers, curtains)
                 _write(planned, folder / state.name, pool, report)
         digests = {state.name: digest_files(folder / state.name) for state in states}
         versions = list_versions()
@@ -117,16 +116,3 @@ def list_versions() -> dict[str, str]:
 
 def _write(planned: PlannedSession, folder: Path, pool: Executor, report: Progress) -> None:
     write_session(make_drive("before", planned), folder, pool, report)
-
-
-def _refuse_moved_curtains(planned: PlannedSession, curtains: dict[str, Float64Array]) -> None:
-    """Note where the curtains of a session hang; refuse one that hangs elsewhere than in an earlier session."""
-    for body in planned.movers:
-        if body.mover.kind != "curtain":
-            continue
-        place = curtains.setdefault(body.mover.name, body.course.points[0])
-        if not np.array_equal(place, body.course.points[0]):
-            raise ScenarioError(
-                f"{planned.own_name}: mover {body.mover.name!r}: the curtain finds no way where it hung before, and a "
-                "curtain that hangs elsewhere is a change: give its path between, fractions and lateral"
-            )

@@ -58,16 +58,16 @@ def _middle_s(drive: Trajectory) -> float:
 
 
 def list_pools(world: World, scenario: Scenario, seed: int) -> dict[str, Pool]:
-    """Return every puddle by its name; the name of one that only one session has says which.
+    """Return every puddle by its name; the name of one says the session where the other has none, or another floor.
 
     Raises:
         ScenarioError: There is no floor under a puddle.
     """
-    found = {}
+    found: dict[str, Pool] = {}
     for session in SESSIONS:
-        for pool in lay_puddles(scenario, world.centreline, world.walls, session, seed):
-            where = "" if pool.puddle.sessions == "both" else f" ({session})"
-            found[f"{pool.puddle.name}{where}"] = pool
+        for pool in lay_puddles(scenario, world.centreline, world.of(session).walls, session, seed):
+            is_alike = pool.puddle.sessions == "both" and not scenario.surface
+            found[pool.puddle.name if is_alike else f"{pool.puddle.name} ({session})"] = pool
     return found
 
 

@@ -354,8 +354,9 @@ def _label(item: Standing) -> Label:
 
 
 def _where(item: Standing) -> str:
-    """Return the session in brackets for the two places of a moved or aged prop and the shapes of a reshaped one."""
+    """Return the session in brackets for both places of a moved, aged or carried prop, and shapes of a reshaped one."""
     is_twice = item.prop.change in ("moved", "reshaped") or item.prop.aged is not None
+    is_twice |= item.prop.change == "none" and len(item.sessions) == 1
     return f" ({min(item.sessions)})" if is_twice else ""
 
 

@@ -182,6 +182,21 @@ def test_extends_merges_mappings_replaces_lists_and_keeps_the_draws(tmp_path: Pa
     assert 4 <= scenario.tunnel.section.height_m < 5
 
 
+def test_what_a_child_draws_from_options_replaces_what_the_base_gives(tmp_path: Path) -> None:
+    written(tmp_path, WORLD)
+    child = "extends: world.yaml\nplatform: {one_of: [{kind: quadrotor, sensor_height_m: 1.5}], clearance_m: 0.4}\n"
+    platform = load_scenario(written(tmp_path, child, "child.yaml"), 0).platform
+    assert (platform.kind, platform.sensor_height_m, platform.clearance_m) == ("quadrotor", 1.5, 0.4)
+
+
+@pytest.mark.parametrize("nodes", ["tunnel.nodes={}", "tunnel.nods={a: [0, 0, 0]}", "tunnel.nodes=3"])
+def test_a_tunnel_without_nodes_has_a_line_for_each_mistake(tmp_path: Path, nodes: str) -> None:
+    text = "family: x\ntunnel: {drifts: [{nodes: [a, b]}]}\nbefore: {route: [a, b]}\nafter: {route: [a, b]}\n"
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(written(tmp_path, text), 0, [nodes])
+    assert ("no node of the tunnel is called a" in str(caught.value)) == (nodes == "tunnel.nodes={}")
+
+
 def test_a_child_may_replace_a_distribution_by_another(tmp_path: Path) -> None:
     written(tmp_path, WORLD)
     child = "extends: world.yaml\ntunnel: {section: {width_m: {choice: [7]}, height_m: {integers: [4, 5]}}}\n"

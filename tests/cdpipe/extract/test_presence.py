@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import cdpipe.extract.presence
-from cdpipe.core.geometry import stream
+from cdpipe.core.geometry import make_pose, stream
 from cdpipe.extract.objects import PointGroup
-from cdpipe.extract.presence import is_fleeting
+from cdpipe.extract.presence import Sight, is_fleeting
 from cdpipe.model.config import ExtractConfig
 from cdpipe.model.types import PosedScan
 from tests.cdpipe.cut_rooms import CONFIG, CRATE, Scanned, cut, iou, returns_of, scanned
@@ -137,6 +138,23 @@ class Plume(RoomScans):
         empty, full = super().scan(index), self._crate.scan(index)
         points = np.where(self._is_met[index][:, None], full.points_sensor, empty.points_sensor)
         return replace(empty, points_sensor=points)
+
+
+@pytest.mark.parametrize("n_at_rest", [0, 20, 600])
+def test_a_robot_at_rest_beside_a_thing_that_it_does_not_see_counts_once(n_at_rest: int) -> None:
+    # the thing is hit from 10 to 40 m of the way, and seen through 0.4 times as often; the robot rests at 8 m
+    path_m = np.concatenate([np.arange(0, 8, 0.1), np.full(n_at_rest, 8.0), np.arange(8, 60, 0.1)])
+    keyframes = np.unique(np.searchsorted(path_m, np.arange(0, 60, 1.0)))
+    hits = 100 * ((path_m[keyframes] >= 10) & (path_m[keyframes] <= 40))
+    sight = Sight.__new__(Sight)
+    sight._seen = np.flatnonzero((path_m >= 10) & (path_m <= 40))
+    sight._path_m, sight._keyframe_scans = path_m, keyframes
+    sight._odom_T_sensor = make_pose(translation=np.column_stack([path_m, 0 * path_m, 0 * path_m]))
+    sight._off_m = np.maximum(np.maximum(10 - path_m, path_m - 40), 0.0)
+    sight._looks = SimpleNamespace(  # type: ignore[assignment]
+        n_through=0.4 * hits, n_hit=hits, n_pixel_through=0 * hits, n_pixel_hit=hits
+    )
+    assert not sight.is_passing()
 
 
 def test_what_few_rays_meet_is_no_change(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -92,6 +92,11 @@ def test_without_another_session_an_object_stands_on_its_lowest_point() -> None:
     assert column_volume_m3(cone(1.5, 0.9), NOTHING) == pytest.approx(np.pi * 1.5**2 * 0.3, rel=0.02)
 
 
+def test_what_hangs_is_measured_up_to_the_roof() -> None:
+    # the underside of a box of 1 m x 1 m x 0.3 m below a roof
+    assert column_volume_m3(sheet(0.5, 0.7), sheet(1.5, 1.0)) == pytest.approx(0.9**2 * 0.3, rel=0.05)
+
+
 def test_what_was_loaded_away_is_measured_down_to_what_is_left() -> None:
     # a block 2 m x 2 m x 1 m of which a wedge is gone: nothing at y = -1, all of it at y = +1
     taken, left = sheet(1.0, 1.0), sheet(1.0, 1.0)

@@ -62,6 +62,14 @@ def test_a_shift_against_the_yaw_is_no_agreement() -> None:
     assert count_votes(before, after, np.full(2, np.pi))[0][0, 1]
 
 
+@pytest.mark.parametrize(("rise_m", "is_agreed"), [(4.0, True), (4.2, False), (-4.2, False)])
+def test_places_of_another_turn_of_a_decline_do_not_agree(rise_m: float, is_agreed: bool) -> None:
+    # 2 m and 7 % of 30 m
+    before, after = poses_at((0, 0), (30, 0)), poses_at((0, 0), (30, 0))
+    after[1, 2, 3] = rise_m
+    assert bool(count_votes(before, after, np.zeros(2))[0][0, 1]) is is_agreed
+
+
 @pytest.mark.parametrize("is_upside_down", [False, True])
 def test_however_the_sensor_hangs_yaws_and_places_say_the_same(is_upside_down: bool) -> None:
     # the after odom frame is turned by 40 degrees; at each place both sensors look another way

@@ -8,7 +8,7 @@ import pytest
 from cdpipe.core.geometry import Float64Array, invert, make_pose, yaw_pose
 from cdpipe.model.config import PipelineConfig, QueryConfig, RegionsConfig
 from cdpipe.model.types import DescriptorSet, MergedMaps, PointMap
-from cdpipe.query.query import find_regions, rank_regions
+from cdpipe.query.query import _find_ends, find_regions, rank_regions
 
 
 def session(positions: list[tuple[float, float, float]], q: list[list[float]]) -> tuple[PointMap, DescriptorSet]:
@@ -210,6 +210,19 @@ def test_scores_of_spheres_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     # but one has nothing surer than -1 within 4.5 m; the last was not visited again
     np.testing.assert_allclose(found.keyframe_scores, [2.8, 3.0, 2.8, 2.6, -1.0, np.nan])
     assert found.scores.max() == 8.0
+
+
+def test_where_both_sessions_turned_back_is_always_looked_at() -> None:
+    def ends(x_m: list[float], others_m: list[float]) -> list[int]:
+        places = (np.column_stack([each, np.zeros((len(each), 2))]) for each in (x_m, others_m))
+        return _find_ends(*places, QueryConfig(max_pair_m=2.0)).tolist()
+
+    way = [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert ends(way, [-1.5, 2.0, 5.5]) == [0, 4]
+    assert ends(way, [5.5, 2.5]) == [4]  # driven the other way, and not as far
+    assert ends(way, [9.0, 2.0, -3.0]) == []
+    assert ends([1.0], [0.0]) == [0]
+    assert ends([], way) == ends(way, []) == []
 
 
 def test_scores_of_the_sphere_difference_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -105,6 +107,14 @@ def test_stretches_are_put_together_in_order(
     again = near_returns(merged, "before")
     assert np.array_equal(again.points, returns.points)
     assert np.array_equal(again.cell_of, returns.cell_of)
+
+
+def test_stations_share_no_fold_wherever_they_stand(returns: NearReturns) -> None:
+    n = len(returns.points)
+    places = np.repeat(np.arange(4), -(-n // 4))[:n]
+    for apart_m in (4.0, 4.5, 8.0):
+        cells = make_cells(replace(returns, path_m=apart_m * places, cell_of=np.zeros(n, np.int64)))
+        assert np.isfinite(cells.fold_offsets).all(), apart_m
 
 
 def test_without_folds_the_cells_are_the_same(returns: NearReturns) -> None:

@@ -279,6 +279,19 @@ def test_motions_are_found_again_with_a_third_of_outliers() -> None:
     np.testing.assert_allclose(found.along(points, normals, points[:, 0])[0], clean_m, atol=5e-4)
 
 
+@pytest.mark.parametrize("apart_m", [5.0, 8.0, 15.0])
+def test_stations_far_from_one_another_tell_motions_where_they_stand(apart_m: float) -> None:
+    rng = stream(6, "stations")
+    normals = rng.normal(size=(600, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    path_m = np.repeat([0.0, apart_m, 2 * apart_m], 200)
+    points = rng.uniform(-3, 3, (600, 3)) + path_m[:, None] * [1, 0, 0]
+    found = fit_motions(points, normals, 0.01 * normals[:, 2], path_m, 4.0)
+    moved_m, variance_m2 = found.along(points, normals, path_m)
+    np.testing.assert_allclose(moved_m, 0.01 * normals[:, 2], atol=1e-4)
+    assert np.isfinite(variance_m2).all()
+
+
 def test_too_few_offsets_tell_no_motion() -> None:
     points, unknown = np.zeros((5, 3)), np.full(5, np.nan)
     for along_m in (np.zeros(5), unknown):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from cdpipe.core.errors import ScenarioError
 from scenarios.schema import MeshFile, Prop, PropKind
 from sim.geometry.mesh import box_mesh, join_meshes, move_mesh
 from sim.geometry.raycast import Caster
@@ -89,6 +90,18 @@ def test_volumes_of_a_box(make_prop: Callable[..., Prop]) -> None:
     assert shape.hull_volume_m3 == pytest.approx(0.24)
     # The lid's groove is 3 % of the height, and 1.5 % of 0.6 m deep on every side.
     assert shape.mesh_volume_m3 == pytest.approx(0.24 - 0.015 * (0.8 * 0.6 - (0.8 - 0.018) * (0.6 - 0.018)))
+
+
+@pytest.mark.parametrize(
+    ("kind", "size_m"),
+    [("crate", (5, 5, 0.01)), ("crate", (0.03, 0.3, 0.3)), ("trolley", (0.6, 0.05, 0.9)), ("chair", (1e-3,) * 3),
+     ("muck_pile", (0.2, 0.2, 0.1))],
+)  # fmt: skip
+def test_a_size_without_room_for_the_parts_is_refused(
+    kind: str, size_m: tuple[float, float, float], make_prop: Callable[..., Prop]
+) -> None:
+    with pytest.raises(ScenarioError, match=r"^props\.it\.size_m = \[.*\]: (leaves no room|cannot be built)"):
+        shape_of(make_prop("it", kind=kind, size_m=size_m), 0)
 
 
 def test_a_small_box_is_of_cardboard(make_prop: Callable[..., Prop]) -> None:

@@ -142,6 +142,14 @@ def test_one_ray_and_seven_glare_alike_and_the_draw_is_the_seeds(sensor: SensorM
     np.testing.assert_array_equal(seven.range_mm, again.range_mm)
 
 
+def test_returns_of_no_geom_are_no_reflectors(sensor: SensorMetadata) -> None:
+    echo = bare_echo(sensor, hall(RETRO))
+    for geom in (-1, -3, -4):  # nothing, dust, a mirror image; fewer geoms than that
+        other = replace(echo, geom=np.full_like(echo.geom, geom))
+        draws = np.zeros(echo.range_m.shape, np.float32)
+        assert add_glare(other, None, still(sensor), sensor, np.array([True]), draws)[0] is other
+
+
 def test_a_family_with_markers_keeps_the_world_of_its_clean_twin() -> None:
     small = ["platform.scan_spacing_m=4", "sensor.mode=512x10"]
     glare, clean = (load_scenario(name, 10001, small) for name in ("glare/null", "unchanged/narrow"))
