@@ -97,7 +97,7 @@ def _find_ends(positions: Float64Array, others: Float64Array, config: QueryConfi
         return np.zeros(0, dtype=np.int64)
     outer = np.unique([0, len(positions) - 1])
     apart_m = np.linalg.norm(positions[outer, None] - others[[0, -1]], axis=2).min(axis=1)
-    return outer[apart_m <= config.max_pair_m]
+    return np.asarray(outer[apart_m <= config.max_pair_m], dtype=np.int64)
 
 
 def score_keyframes_by_share(
