@@ -149,7 +149,11 @@ def find_air(drive: Drive, number: int) -> AirVolume | None:
     if plan.air is None and puffs is None:
         return None
     position_m = drive.trajectory.true.sample(time_s)[0][0]
-    floor_z_m = position_m[2] - (plan.height_m or drive.scenario.platform.sensor_height_m)
+    height_m = plan.height_m or drive.scenario.platform.sensor_height_m
+    if plan.trajectory is not None:  # of a recorded drive: what lies below it, if anything does
+        met_m = float(drive.scene.caster.cast(position_m[None], (0.0, 0.0, -1.0))[0][0])
+        height_m = met_m if np.isfinite(met_m) else height_m
+    floor_z_m = position_m[2] - height_m
     told = position_m, float(floor_z_m), float(time_s[0]), drive.seed, drive.session, puffs
     return air_around(plan.air or Air(), *told)
 

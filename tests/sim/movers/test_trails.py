@@ -14,7 +14,7 @@ from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, make_pose
 from cdpipe.io.session import read_session
 from scenarios import load_scenario
-from scenarios.schema import Air, Dust, Scenario
+from scenarios.schema import Air, Dust, Scenario, SessionPlan
 from sim.movers.trails import raise_dust
 from sim.sensor.air import AIR, air_around
 from sim.sensor.plumes import DIFFUSIVITY_M2_PER_S, LIFE_S, SETTLING_S, WAKE_SIGMA_M, Puffs, fill_lattice
@@ -91,3 +91,20 @@ def test_a_scene_without_plumes_has_clear_air_and_people_raise_none() -> None:
     assert find_air(drive, 0) is None
     with pytest.raises(ScenarioError, match="a person raises no dust: leave dust_mg_per_m out"):
         load_scenario("smoke/unchanged", 3, ["movers=[{name: p, kind: person, dust_mg_per_m: 3}]"])
+
+
+def test_the_dust_of_a_recorded_drive_lies_on_its_floor(tmp_path: Path) -> None:
+    base = load_scenario("smoke/unchanged", 3, ["before.air.dust.mg_per_m3=100"])
+    line = [[4 + 0.5 * step, 0, 2.0, 0, 0, 0, 1] for step in range(12)]  # 1.9 m and more above the floor
+    np.savetxt(tmp_path / "t.tum", [[0.5 * step, *pose] for step, pose in enumerate(line)])
+    plan = SessionPlan(trajectory=str(tmp_path / "t.tum"), air=base.before.air)
+    drive = plan_drives(base.model_copy(update={"before": plan}), 3)[0]
+    air = find_air(drive, 0)
+    assert air is not None and air.dust is not None
+    assert air.dust.floor_z_m == pytest.approx(0.07, abs=0.3)
+    driven = plan_drives(base, 3)[0]
+    nominal = find_air(driven, 0)
+    assert nominal is not None and nominal.dust is not None
+    assert nominal.dust.floor_z_m == pytest.approx(
+        driven.trajectory.true.sample(driven.trajectory.revolution_s[:1])[0][0, 2] - 0.8
+    )
