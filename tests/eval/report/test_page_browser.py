@@ -59,8 +59,9 @@ def write_large_run(folder: Path) -> Path:
             for domain in ("in", "out") for place, name in enumerate(METHODS)
         ]  # fmt: skip
         pd.concat(parts).to_csv(folder / f"{file}.csv", index=False)
+    n_pairs = len(SCENARIOS) * N_SEEDS
     table = [
-        {"domain": domain, "variant": name, "n_pairs": 100, "n_failed": 0, "n_observable": 400, "n_found": 100,
+        {"domain": domain, "variant": name, "n_pairs": n_pairs, "n_failed": 0, "n_observable": 400, "n_found": 100,
          "false_regions_per_100m": 0.2, "region_auroc_pooled": 0.5, "n_unchanged": 0, "recall_at_0.1": 0.5,
          "recall_at_0.1_low": 0.4, "recall_at_0.1_high": 0.6, "recall_at_0.1_proposed": 0.4}
         for domain in ("in", "out") for name in METHODS
