@@ -11,7 +11,7 @@ import pytest
 from cdpipe.core.geometry import BoolArray, Float64Array
 from cdpipe.mapping import movers
 from cdpipe.mapping.mapping import build_map
-from cdpipe.mapping.movers import drop_movers
+from cdpipe.mapping.movers import _stand_up, drop_movers
 from cdpipe.model.config import MapConfig, load_config
 from cdpipe.model.types import PointMap, PosedScan, ScanSource
 
@@ -134,6 +134,16 @@ def test_a_floor_under_water_stays_and_a_leaning_sheet_that_comes_and_goes_does_
     assert drop_movers(wet) is wet
     leaning = build_map(Pool(leans=0.7), CONFIG)
     assert len(drop_movers(leaning).points) < len(leaning.points) - 100
+
+
+def test_floor_that_is_dropped_with_the_foot_of_a_thing_has_not_moved() -> None:
+    x, y = (each.ravel() for each in np.meshgrid(np.arange(0, 8, 0.2), np.arange(0, 4, 0.2)))
+    floor = np.column_stack([x, y, 0.05 * np.sin(x)])
+    foot = np.column_stack([np.full(20, 1.0), np.full(20, 1.0), np.linspace(0.0, 1.0, 20)])
+    truck = np.column_stack([20.0 + x[x < 2], y[x < 2], 2.0 * np.abs(np.sin(5 * y[x < 2]))])
+    standing = _stand_up(np.concatenate([floor, foot, truck]), 0.2)
+    assert standing.tolist() == [False] * (len(floor) + len(foot)) + [True] * len(truck)
+    assert _stand_up(np.zeros((0, 3)), 0.2).shape == (0,)
 
 
 def test_returns_go_with_their_points(monkeypatch: pytest.MonkeyPatch) -> None:
