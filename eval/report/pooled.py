@@ -28,7 +28,8 @@ def pooled_recalls(data: RunData, cases: pd.DataFrame) -> pd.DataFrame:
     """Return recall at a rate of false regions, with its 95 % interval, for each domain and variant of some cases.
 
     regions_table.csv has it over all pairs of a run, a world's repetitions with other settings among them. Where those
-    are more, it is computed anew; NaN where regions.csv or changes.csv is not there.
+    are more, it is computed anew. Where it is not known of one method, because regions.csv or changes.csv is not there,
+    it is NaN for all of the domain: else the others would be ranked by it alone.
 
     Args:
         data: The run.
@@ -47,7 +48,10 @@ def pooled_recalls(data: RunData, cases: pd.DataFrame) -> pd.DataFrame:
             is_whole = row.get("n_pairs") == len(own)
             figures = {key: row.get(key, math.nan) for key in COLUMNS[3:]} if is_whole else _recall(data, own)
             rows.append({**names, **figures})
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    table = pd.DataFrame(rows, columns=list(COLUMNS))
+    unknown = set(table.loc[table[POOLED].isna(), "domain"])
+    table.loc[table["domain"].isin(unknown), list(COLUMNS[3:])] = math.nan
+    return table
 
 
 def _recall(data: RunData, own: pd.DataFrame) -> dict[str, float]:

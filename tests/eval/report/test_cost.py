@@ -8,6 +8,8 @@ import pandas as pd
 import pytest
 
 from eval.report.cost import COLUMNS, _drawing, draw_pareto, front, pareto_table
+from eval.report.pooled import pooled_recalls
+from eval.running.results.cases import comparable
 from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
 from tests.eval.report.drawing.drawn import read_panels
@@ -106,6 +108,9 @@ def test_recall_at_a_rate_is_taken_from_the_table_of_regions(tmp_path: Path) -> 
     pd.DataFrame(stored).assign(n_pairs=132).to_csv(tmp_path / "regions_table.csv", index=False)
     table = pareto_table(run(tmp_path, {"a": (NAN, 1.0, 1.0), "b": (NAN, 2.0, 1.0)}))
     assert "recall_at_0.1" not in set(table["quality"])
+    pd.DataFrame(stored).assign(n_pairs=[6, 132, 6, 132]).to_csv(tmp_path / "regions_table.csv", index=False)
+    data = run(tmp_path, {"a": (NAN, 1.0, 1.0), "b": (NAN, 2.0, 1.0)})
+    assert pooled_recalls(data, comparable(data))["recall_at_0.1"].isna().all()
 
 
 def test_one_method_is_no_comparison(tmp_path: Path) -> None:
