@@ -144,8 +144,8 @@ class Sight:
             return True
         is_near = at_keyframes_m <= _PASS_M
         n_through, n_hit = looks.n_through[is_near].sum(), looks.n_hit[is_near].sum()
-        # weighted by path length, as in `is_double`
-        way_m = np.diff(self._path_m, prepend=0.0)
+        # weighted by path length, as in `is_double`, but for a robot that never moved
+        way_m = np.diff(self._path_m, prepend=0.0) if self._path_m[-1] > 0 else np.ones(len(self._path_m))
         is_seldom = way_m[self._seen].sum() < _SELDOM * way_m[self._off_m <= _PASS_M].sum()
         return bool(n_through > (_SELDOM_ON_ITS_WAY if is_seldom else _ON_ITS_WAY) * n_hit)
 

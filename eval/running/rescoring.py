@@ -58,15 +58,15 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
             progress.cells("{scenario} {seed} {variant}".format(**identity), len(documents), len(folders))
             score = score_stored(truth, folder, may_end_early=key != NO_KEY)
             documents[path] = cell_document(score, identity, key, place)
-    left = _list_unscored(run, documents)
+    n_scored, left = len(documents), _list_unscored(run, documents)
     for path, document in documents.items():
         write_json(path, document)
-    progress.cells("done", len(documents), len(documents))
+    progress.cells("done", n_scored, n_scored)
     if left:
         told = f"{len(left)} cells of another metrics version have no answer here, as {left[0]}"
         progress.note(f"{run.path}: {told}: `run` the plan again with --force, which makes them anew")
     write_tables(run)
-    return len(documents)
+    return n_scored
 
 
 def _list_unscored(run: RunFolder, documents: dict[Path, dict[str, Any]]) -> list[str]:

@@ -155,6 +155,10 @@ def test_a_robot_at_rest_beside_a_thing_that_it_does_not_see_counts_once(n_at_re
         n_through=0.4 * hits, n_hit=hits, n_pixel_through=0 * hits, n_pixel_hit=hits
     )
     assert not sight.is_passing()
+    # a robot that never moves has scans alone to count: two of three do not see it here
+    sight._path_m, sight._seen = 0 * path_m, np.arange(0, len(path_m), 3)
+    sight._off_m = 0 * path_m
+    assert sight.is_passing()
 
 
 def test_what_few_rays_meet_is_no_change(monkeypatch: pytest.MonkeyPatch) -> None:
