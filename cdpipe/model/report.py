@@ -325,10 +325,8 @@ def _tabulate_surface(surface: SurfaceField | None) -> pd.DataFrame:
         sure = own[np.isfinite(levels_m[own])]  # a place without a level tells of no share
         level_m = np.median(levels_m[sure]) if len(sure) else np.nan
         beyond = (np.abs(values_m[sure]) > levels_m[sure]).mean() if len(sure) else np.nan
-        measured, in_regions = (
-            (values_m[own].mean(), values_m[largest], level_m),
-            (surface.region[known[own]] >= 0).sum(),
-        )
+        measured = values_m[own].mean(), values_m[largest], level_m
+        in_regions = (surface.region[known[own]] >= 0).sum()
         rows.append((start_m, start_m + 1, _SECTORS[which], len(own), *measured, beyond, in_regions))
     return pd.DataFrame(rows, columns=_SURFACE_COLUMNS)
 

@@ -71,7 +71,8 @@ def pareto_table(data: RunData) -> pd.DataFrame:
     found: list[pd.DataFrame] = []
     for domain in [name for name in DOMAINS if name != ALL_DOMAINS and len(results)]:
         methods = results[results["domain"] == domain].groupby("variant", sort=False)
-        for quality in (_RECALL_AT_RATE if pooled[_RECALL_AT_RATE].notna().any() else _RECALL_AT_K, _F1):
+        is_known = pooled.loc[pooled["domain"] == domain, _RECALL_AT_RATE].notna().any()
+        for quality in (_RECALL_AT_RATE if is_known else _RECALL_AT_K, _F1):
             values = {name: _quality(own, quality, pooled) for name, own in methods}
             for cost in (_TIME, _BYTES):
                 rows = [

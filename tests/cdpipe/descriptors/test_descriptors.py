@@ -68,6 +68,7 @@ def test_descriptors_are_unit_vectors_and_survive_the_disk(tmp_path: Path, metho
     assert load_descriptors(tmp_path, config, poses, MapConfig()) is None
     path = save_descriptors(tmp_path, made, poses, MapConfig())
     assert load_descriptors(tmp_path, config, poses + 1e-9, MapConfig()) is None  # recorded anew
+    assert load_descriptors(tmp_path, config, poses, MapConfig(airborne="drop")) is None  # without its dust
     read = load_descriptors(tmp_path, config, poses, MapConfig())
     assert read is not None
     np.testing.assert_array_equal(read.q, made.q)

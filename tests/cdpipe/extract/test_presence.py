@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -151,9 +152,8 @@ def test_a_robot_at_rest_beside_a_thing_that_it_does_not_see_counts_once(n_at_re
     sight._path_m, sight._keyframe_scans = path_m, keyframes
     sight._odom_T_sensor = make_pose(translation=np.column_stack([path_m, 0 * path_m, 0 * path_m]))
     sight._off_m = np.maximum(np.maximum(10 - path_m, path_m - 40), 0.0)
-    sight._looks = SimpleNamespace(  # type: ignore[assignment]
-        n_through=0.4 * hits, n_hit=hits, n_pixel_through=0 * hits, n_pixel_hit=hits
-    )
+    through = 0.4 * hits
+    sight._looks = cast(Any, SimpleNamespace(n_through=through, n_hit=hits, n_pixel_through=0 * hits, n_pixel_hit=hits))
     assert not sight.is_passing()
     # a robot that never moves has scans alone to count: two of three do not see it here
     sight._path_m, sight._seen = 0 * path_m, np.arange(0, len(path_m), 3)

@@ -27,11 +27,13 @@ from eval.plans.cells import expand_cells
 from eval.plans.changes import change_plan
 from eval.plans.plan import Plan, load_plan
 from eval.running import pair_run
+from eval.running.cell_rows import ITEM_TABLES
 from eval.running.pair_run import Tools
-from eval.running.rescoring import rescore
+from eval.running.rescoring import _list_unscored, rescore
 from eval.running.runfolder import RunFolder, open_run_folder, start_run_folder, write_json, write_tables
 from eval.running.runner import RunOutcome, _provenance
 from eval.running.stages.pair_stages import time_parts
+from eval.scoring.scoring import METRICS_VERSION
 from eval.truth.adapters import pipeline_input
 from tests.eval.running.runs import (
     MAPLESS,
@@ -495,6 +497,39 @@ def test_cells_are_made_again_with_another_version_of_an_extra_that_they_may_ask
     there, missing = keys("1.0"), keys("absent")
     changed = {variant: there[variant] != missing[variant] for variant in there}
     assert changed == {"tunnelcd": True, "frame": False, "kiss-matcher": True, "oracle-merge": False}
+
+
+@pytest.mark.parametrize(("method", "is_asked"), [("planes", False), ("m3c2", True), ("m3c2-ep", True)])
+def test_cells_that_measure_rock_with_an_extra_depend_on_its_version(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str, is_asked: bool
+) -> None:
+    variants = f"{{preset: c2c, set: [surface.method={method}, merge.fallback=false]}}"
+    (cell,) = expand_cells(plan_of(tmp_path, variants=variants))
+    keys = set()
+    for version in ("1.0", "absent"):
+        monkeypatch.setattr(pair_run, "extra_version", lambda name, version=version: version)
+        keys.add(pair_run.cell_key(cell, "clean", None, {}))
+    assert len(keys) == 1 + is_asked
+
+
+def test_a_cell_without_truth_gets_the_version_and_one_without_answer_is_told(tmp_path: Path) -> None:
+    run = start_run_folder(tmp_path / "run")
+    for name, row in (
+        ("unmade", {"status": "failed", "n_observable": None}),
+        ("lost", {"status": "ok", "n_observable": 1}),
+    ):
+        named, items = {"scenario": "w", "seed": 1, "variant": name}, {table: [] for table in ITEM_TABLES}
+        document = {
+            "key": "k",
+            "order": [0, 0],
+            "row": {**named, "metrics_version": METRICS_VERSION - 1, **row},
+            **items,
+        }
+        write_json(run.path / "cells" / "w" / "1" / f"{name}.json", document)
+    documents: dict[Path, dict[str, Any]] = {}
+    assert _list_unscored(run, documents) == ["w/1/lost"]
+    ((path, document),) = documents.items()
+    assert (path.stem, document["row"]["metrics_version"]) == ("unmade", METRICS_VERSION)
 
 
 @pytest.mark.parametrize(

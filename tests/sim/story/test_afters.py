@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from cdpipe.core.errors import ScenarioError
 from scenarios.library import load_scenario
+from sim.movers.mover import MovingBody
 from sim.session.simulate import HeldPair, simulate_in_memory
 from sim.story.afters import simulate_afters
 from sim.story.curtains import refuse_moved_curtains
@@ -22,23 +23,16 @@ def ranges_mm(pair: HeldPair, session: str) -> np.ndarray:
     return np.concatenate([held.chunk(number).range_mm for number in range(held.n_chunks)])
 
 
-@dataclass(frozen=True)
-class Hung:
-    """What `refuse_moved_curtains` asks of a curtain."""
-
-    mover: SimpleNamespace
-    course: SimpleNamespace
-
-
 def test_a_curtain_that_would_hang_elsewhere_is_refused() -> None:
-    def hung(x_m: float, kind: str = "curtain") -> Hung:
-        return Hung(SimpleNamespace(kind=kind, name="c"), SimpleNamespace(points=np.array([[x_m, 1.0, 2.0]])))
+    def hung(x_m: float, kind: str = "curtain") -> MovingBody:
+        course = SimpleNamespace(points=np.array([[x_m, 1.0, 2.0]]))
+        return cast(MovingBody, SimpleNamespace(mover=SimpleNamespace(kind=kind, name="c"), course=course))
 
     curtains: dict[str, np.ndarray] = {}
     for place in (hung(3.0), hung(3.0), hung(5.0, "person")):
-        refuse_moved_curtains("after", [place], curtains)  # type: ignore[list-item]
+        refuse_moved_curtains("after", [place], curtains)
     with pytest.raises(ScenarioError, match="session-02: mover 'c': the curtain finds no way where it hung before"):
-        refuse_moved_curtains("session-02", [hung(5.0)], curtains)  # type: ignore[list-item]
+        refuse_moved_curtains("session-02", [hung(5.0)], curtains)
 
 
 @pytest.fixture(scope="module", name="pairs")

@@ -24,6 +24,7 @@ from eval.studies.descriptors.compare import tabulate_places, tabulate_spheres
 from eval.studies.descriptors.rows import describe_keyframes, measure_pair, measure_scans, measure_spheres, score_places
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import SESSIONS, load_ground_truth
+from scenarios.library import load_scenario
 
 
 def mapped_pair(pair: Path) -> list[MappedSession]:
@@ -214,3 +215,12 @@ def test_mistakes_are_one_line(arguments: list[str], words: str, tmp_path: Path)
     assert done.stderr.startswith("error: ")
     assert words in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("setting", "is_other"),
+    [("sphere.frames=sensor", True), ("query.radius_m=4.5", True), ("query.threshold=1", False)],
+)
+def test_rows_are_of_the_settings_that_scores_depend_on(setting: str, is_other: bool) -> None:
+    scenario = load_scenario("smoke/one_box", 10000)
+    assert (command._key(scenario, 10000, [setting]) != command._key(scenario, 10000, [])) == is_other
