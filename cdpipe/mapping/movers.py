@@ -19,6 +19,7 @@ import numpy as np
 
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 from cdpipe.core.geometry.groups import label_groups
+from cdpipe.core.geometry.planes import is_level_sheet
 from cdpipe.core.spooled import SpooledArray
 from cdpipe.mapping.free_space import count_through_and_hit
 from cdpipe.model.types import KeyframeViews, PointMap
@@ -30,9 +31,8 @@ _LEAST_POINTS, _OF_CELLS_M = 60, 0.2
 _LINK_CELLS = 2.0
 # The stricter kind was seen through by so many keyframes, and so many times as many as hit it; the other by more.
 _STRICT_THROUGH, _STRICT_FACTOR, _LEAST_THROUGH = 3, 2, 2
-# A sheet: the middle 90 % of the stricter points within this thickness, their plane within this angle of level. Floors
-# under water (`water/null` 10005 and 10006) are 0.07 to 0.12 m thick.
-_SHEET_M, _LEVEL = 0.3, np.cos(np.deg2rad(20.0))
+# Thickness of a sheet. Floors under water (`water/null` 10005 and 10006) are 0.07 to 0.12 m thick.
+_SHEET_M = 0.3
 # Of what is dropped beside things that stand in a puddle (`water/narrow` 10011) the middle 80 % are 0.13 m high within
 # 2.5 m, of trucks (`dust/haul` 10012 and 10013) 0.5 to 1.9 m.
 _COLUMN_M = 2.5
@@ -80,7 +80,7 @@ def find_movers(points_odom: Float64Array, views: KeyframeViews, voxel_m: float)
     n_strict = np.bincount(labels, is_strict[found], len(sizes))
     is_group = n_strict >= _LEAST_POINTS * (_OF_CELLS_M / voxel_m) ** 2
     for label in np.flatnonzero(is_group):
-        is_group[label] = not _is_level_sheet(points_odom[found[(labels == label) & is_strict[found]]])
+        is_group[label] = not is_level_sheet(points_odom[found[(labels == label) & is_strict[found]]], _SHEET_M)
     is_mover[found] = is_group[labels]
     return is_mover
 
@@ -95,14 +95,6 @@ def _stand_up(points_odom: Float64Array, voxel_m: float) -> BoolArray:
         is_upright[own] = high_m - low_m > _SHEET_M
     labels, sizes = label_groups(points_odom, _LINK_CELLS * voxel_m)
     return np.asarray((np.bincount(labels, is_upright, len(sizes)) > sizes / 2)[labels], dtype=np.bool_)
-
-
-def _is_level_sheet(points_odom: Float64Array) -> bool:
-    """Return whether (N, 3) points lie on one level plane, as a floor does."""
-    centred = points_odom - points_odom.mean(axis=0)
-    normal = np.linalg.eigh(centred.T @ centred)[1][:, 0]
-    low_m, high_m = np.quantile(centred @ normal, (0.05, 0.95))
-    return bool(abs(normal[2]) > _LEVEL and high_m - low_m < _SHEET_M)
 
 
 def _count(points_odom: Float64Array, views: KeyframeViews) -> tuple[Int64Array, Int64Array]:

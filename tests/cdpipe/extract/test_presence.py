@@ -9,11 +9,12 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import cdpipe.extract.presence
 from cdpipe.core.geometry import make_pose, stream
 from cdpipe.extract.objects import PointGroup
-from cdpipe.extract.presence import Sight, is_fleeting
+from cdpipe.extract.presence import Sight, is_fleeting, is_floor
 from cdpipe.model.config import ExtractConfig
 from cdpipe.model.types import PosedScan
 from tests.cdpipe.cut_rooms import CONFIG, CRATE, Scanned, cut, iou, returns_of, scanned
@@ -281,3 +282,53 @@ def test_a_machine_that_left_when_the_robot_was_far_away_is_no_change(session: s
     # the crate beside it, which the same scans hit and others, too, stays
     assert found[0].points_map[:, 0].min() > 3.0
     assert len(both_ways(session, (waiting, waiting.mapped()), other, KEPT)) == 3
+
+
+# A room above a cellar: blocks are its floor, and where one is missing the scans see far down, as in a mirror.
+CELLAR: Box = ((-5.0, -4.0, -3.0), (5.0, 4.0, 3.0))
+SLABS: tuple[Box, ...] = (
+    ((-4.9, -3.9, -2.9), (1.0, 3.9, 0.0)),
+    ((2.5, -3.9, -2.9), (4.9, 3.9, 0.0)),
+    ((1.0, -3.9, -2.9), (2.5, 1.0, 0.0)),
+    ((1.0, 2.5, -2.9), (2.5, 3.9, 0.0)),
+)
+DRY: Box = ((1.0, 1.0, -2.9), (2.5, 2.5, 0.0))
+
+
+@pytest.mark.parametrize("session", ["before", "after"])
+def test_floor_that_water_hides_from_the_other_session_is_no_change(
+    session: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def over_cellar(boxes: tuple[Box, ...], sample: int) -> Scanned:
+        scans = RoomScans((*SLABS, *boxes), sample, room=CELLAR)
+        return scans, scans.mapped()
+
+    wet, dry = over_cellar((), 1), over_cellar((DRY,), 2)
+    assert both_ways(session, dry, wet) == []
+    assert len(both_ways(session, over_cellar((DRY, CRATE), 2), wet)) == 1  # what stands on it is one
+    monkeypatch.setattr(cdpipe.extract.presence, "is_floor", lambda *_: False)
+    (floor,) = both_ways(session, dry, wet)
+    assert np.ptp(floor.points_map[:, 2]) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("over_m", "thick_m", "slope_deg", "is_bare"),
+    [
+        (0.0, 0.06, 0.0, True),
+        (-0.06, 0.06, 0.0, True),
+        (-0.06, 0.06, 12.0, True),
+        (0.05, 0.06, 0.0, False),
+        (0.05, 0.06, 12.0, False),
+        (-0.06, 0.2, 0.0, False),
+        (-0.06, 0.06, 60.0, False),
+    ],
+)
+def test_floor_is_a_level_sheet_no_higher_than_what_is_around(
+    over_m: float, thick_m: float, slope_deg: float, is_bare: bool
+) -> None:
+    draw = stream(10000, "test", "floor")
+    turn = Rotation.from_euler("y", slope_deg, degrees=True).as_matrix()
+    sheet = draw.uniform((-1.0, -0.5, over_m - thick_m / 2), (1.0, 0.5, over_m + thick_m / 2), (800, 3)) @ turn.T
+    around = draw.uniform((-3.0, -3.0, -0.02), (3.0, 3.0, 0.02), (4000, 3)) @ turn.T
+    assert is_floor(sheet, around) == is_bare
+    assert not is_floor(sheet, around[:0])
