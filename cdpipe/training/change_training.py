@@ -57,6 +57,8 @@ class ChangeTask:
         self._donors = find_donors(training)
         if not len(self._donors):
             raise InputError("training needs keyframes with an object added: make more tunnels")
+        if not any((marks == CHANGED).any() for marks in (validation.before_marks, validation.after_marks)):
+            raise InputError("validation needs an observable change: make more validation tunnels")
 
     def losses(self, step: int) -> dict[str, Tensor]:
         """Return the loss of the change head and that of the visibility head."""

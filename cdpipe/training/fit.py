@@ -15,6 +15,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Protocol
 
+import numpy as np
 import torch
 from pydantic import TypeAdapter
 from safetensors.torch import save
@@ -119,7 +120,8 @@ def fit(
         All validations, in order.
 
     Raises:
-        InputError: The state in `folder` is of another run, or damaged.
+        InputError: The state in `folder` is of another run, or damaged, or the validation tunnels cannot tell which
+            weights are best.
     """
     network = task.network
     optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=1e-3)
@@ -154,7 +156,9 @@ def fit(
         network.load_state_dict(average)
         scores = task.scores()
         network.load_state_dict(last)
-        first = next(iter(scores.values()))
+        name, first = next(iter(scores.items()))
+        if not np.isfinite(first):
+            raise InputError(f"{name} of the validation tunnels is {first}: make more validation tunnels")
         is_best = all(first > next(iter(done.scores.values())) for done in history)
         means = {name: value / n_steps for name, value in sums.items()}
         history.append(Progress(step + 1, means, scores, is_best, perf_counter() - began))

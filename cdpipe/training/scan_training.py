@@ -62,7 +62,7 @@ class PlaceTask:
     """Trains a place network, `network`, on some tunnels and scores it on others.
 
     Raises:
-        InputError: No place of the training tunnels was visited by both sessions.
+        InputError: No place of the training tunnels, or of the validation tunnels, was visited by both sessions.
     """
 
     def __init__(self, network: PlaceNetwork, training: PlaceData, validation: PlaceData, seed: int) -> None:
@@ -76,6 +76,8 @@ class PlaceTask:
                 f"training tunnels: no keyframe within {SAME_PLACE_M:g} m of one of the other session; make tunnels "
                 "that both sessions drive through"
             )
+        if not any(map(len, _partners(validation))):
+            raise InputError("validation needs places that both sessions visit: make more validation tunnels")
 
     def losses(self, step: int) -> dict[str, Tensor]:
         """Return the classification losses of q and w."""

@@ -140,8 +140,12 @@ class SphereTask:
         self._changed = torch.nonzero((targets == 1).any(dim=1))[:, 0].numpy()
         self._unchanged = torch.nonzero((targets == 0).all(dim=1))[:, 0].numpy()
         self._donors = find_donors(training)
-        if not len(self._donors) or not len(self._unchanged):
+        if not len(self._donors) or not len(self._changed) or not len(self._unchanged):
             raise InputError("training needs keyframes with an object added and keyframes without: make more tunnels")
+        if not {0, 1} <= set(validation.labels.tolist()):
+            raise InputError(
+                "validation needs keyframes near a change and keyframes far from all: make more validation tunnels"
+            )
 
     def losses(self, step: int) -> dict[str, Tensor]:
         """Return the classification loss of the sectors and that of the keyframes."""
@@ -196,7 +200,10 @@ class SphereTask:
         }
 
     def finish(self) -> dict[str, float]:
-        """Calibrate the log-odds on the validation tunnels (Platt); return slope, offset and Brier score."""
+        """Calibrate the log-odds on the validation tunnels (Platt); return slope, offset and Brier score.
+
+        The slope is 0 where the network ranks no better than chance.
+        """
         data = self._validation
         used = data.labels >= 0
         pooled = pooled_scores(self.network, data, draw=min(1, data.n_draws - 1))[used]
@@ -209,7 +216,8 @@ class SphereTask:
 def fit_platt(scores: Float64Array, is_positive: BoolArray) -> tuple[float, float, float]:
     """Return slope, offset and mean log-likelihood of the logistic curve that fits (N,) scores best.
 
-    The targets are those of Platt (1999), (n + 1) / (n + 2) and 1 / (n + 2), so separable classes have a finite slope.
+    The curve never falls: scores that rank the wrong way round get slope 0. The targets are those of Platt (1999),
+    (n + 1) / (n + 2) and 1 / (n + 2), so separable classes have a finite slope.
     """
     n_positive = int(np.count_nonzero(is_positive))
     n_negative = len(is_positive) - n_positive
@@ -219,7 +227,7 @@ def fit_platt(scores: Float64Array, is_positive: BoolArray) -> tuple[float, floa
         logits = parameters[0] * scores + parameters[1]
         return float(np.mean(target * np.logaddexp(0.0, -logits) + (1 - target) * np.logaddexp(0.0, logits)))
 
-    found = minimize(loss, np.array([1.0, 0.0]), method="Nelder-Mead")
+    found = minimize(loss, np.array([1.0, 0.0]), method="Nelder-Mead", bounds=((0.0, None), (None, None)))
     return float(found.x[0]), float(found.x[1]), -float(found.fun)
 
 

@@ -35,7 +35,7 @@ class _Funnel(TyperGroup):
             with input_errors(), interrupts_kept():
                 return super().invoke(ctx)
         except KeyboardInterrupt as error:
-            kept = _KEPT.get(ctx.invoked_subcommand or "")
+            kept = None if "--unpack" in sys.argv else _KEPT.get(ctx.invoked_subcommand or "")
             going_on = f"finished {kept} are kept, the same command goes on from there"
             told = going_on if kept else "nothing half-written is left"
             sys.stderr.write(f"interrupted; {told}\n")
@@ -44,7 +44,7 @@ class _Funnel(TyperGroup):
 
 _KEPT = {
     "run": "cells", "demo": "cells", "dataset": "tunnels", "export": "pairs", "story": "comparisons",
-    "evaluate": "pairs",
+    "evaluate": "pairs", "train": "steps up to the last validation",
 }  # fmt: skip
 app = typer.Typer(
     cls=_Funnel,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,6 +13,9 @@ from pathlib import Path
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import visible
 from cdpipe.core.whole_file import partial_of
+
+if sys.platform != "win32":
+    import fcntl
 
 _HEAD_BYTES = 1024
 
@@ -124,6 +128,30 @@ def make_writable(path: Path) -> None:
         raise unwritable(path, error) from error
 
 
+@contextmanager
+def only_writer(folder: Path, command: str) -> Iterator[None]:
+    """Hold a folder against other processes that ask for it; the system lets it go when this process dies.
+
+    Raises:
+        InputError: Another process holds it.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(handle)
+        raise InputError(f"{folder}: another `{command}` writes there: wait until it ends, or name another") from error
+    except OSError:
+        pass  # some network disks hold no locks
+    try:
+        yield
+    finally:
+        os.close(handle)
+
+
 def copy_folder(source: Path, target: Path, copy: Callable[[str, str], object] = shutil.copy2) -> None:
     """Copy a folder with all that is in it, to a new folder or into one that is there.
 
@@ -201,8 +229,14 @@ def remove(path: Path) -> None:
 
 def _name_output(error: BaseException, partial: Path | None, path: Path) -> None:
     """Let the line of a mistake name the output, and not the hidden folder in which it was begun."""
-    if isinstance(error, InputError) and partial is not None:
+    if partial is None:
+        return
+    if isinstance(error, InputError):
         error.args = tuple(str(told).replace(str(partial), str(path)) for told in error.args)
+    elif isinstance(error, OSError):
+        for name in ("filename", "filename2"):
+            if isinstance(told := getattr(error, name), str):
+                setattr(error, name, told.replace(str(partial), str(path)))
 
 
 def unwritable(path: Path, error: OSError) -> InputError:

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.yamlfile import Settings, read_yaml, suggest, validate
-from eval.plans.seeds import parse_seeds_option
+from eval.plans.seeds import parse_seeds
 from eval.plans.splits import load_splits, version_name
 from scenarios.grafted import GraftScenario
 from scenarios.library import load_scenario
@@ -102,7 +102,10 @@ def _find(name_or_path: str) -> Path:
 
 
 def _parse_seeds(path: Path, family: str, text: str) -> tuple[int, ...]:
-    seeds, dev = tuple(parse_seeds_option(text)), load_splits().dev
+    try:
+        seeds, dev = parse_seeds(text), load_splits().dev
+    except ValueError as error:
+        raise InputError(f"{path}: pairs.{family} = {text}: {error}") from error
     for seed in seeds:
         if not dev.first <= seed < dev.end:
             raise InputError(

@@ -61,6 +61,7 @@ def describe_croissant(
     groups: Sequence[FileGroup],
     table: Table,
     published: str | None = None,
+    licence: str = LICENCE,
 ) -> dict[str, Any]:
     """Return the metadata document.
 
@@ -71,6 +72,7 @@ def describe_croissant(
         groups: Files by kind.
         table: The table that lists the items.
         published: Day, ISO 8601; None for data that were not published.
+        licence: Address of the licence, or words.
     """
     context = json.loads((resources.files("eval") / "release" / "context.json").read_text(encoding="utf-8"))
     return {
@@ -79,7 +81,7 @@ def describe_croissant(
         "name": visible(name),
         "description": visible(description),
         "conformsTo": "http://mlcommons.org/croissant/1.0",
-        "license": LICENCE,
+        "license": licence,
         "url": _PAPER,
         "citeAs": _CITE,
         "version": version,

@@ -24,7 +24,7 @@ from cdpipe.core.whole_file import whole_file
 from cdpipe.descriptors import checkpoint_digest, list_checkpoints, use_threads
 from cdpipe.io.answer import write_answer, write_failure
 from cdpipe.methods.registry import PACKAGES, list_extras
-from cdpipe.model.config import WEIGHTS, MapConfig
+from cdpipe.model.config import WEIGHTS_FILES, MapConfig
 from eval.core.domains import domain_of
 from eval.core.output import remove
 from eval.core.provenance import canonical_json, digest_parts, git_commit, now
@@ -48,8 +48,6 @@ from scenarios.schema import Scenario
 
 if sys.platform != "win32":
     import fcntl
-
-_WEIGHTS = {setting.partition(".")[0]: {"weights"} for setting in WEIGHTS}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -270,7 +268,7 @@ def _describe_method(cell: Cell) -> dict[str, object]:
     weights = list_checkpoints(cell.config)
     return {
         # the digests name the weights, wherever their files lie
-        "config": cell.config.model_dump(mode="json", exclude=_WEIGHTS),
+        "config": cell.config.model_dump(mode="json", exclude=WEIGHTS_FILES),
         "checkpoint": checkpoint_digest(cell.config.descriptor),
         **{name: found for name, found in weights.items() if name == cell.config.regions.source},
         "oracle": None if cell.oracle is None else cell.oracle.model_dump(mode="json"),

@@ -17,16 +17,17 @@ from pathlib import Path
 import cdpipe
 from cdpipe.core.errors import InputError, MergeFailedError
 from cdpipe.core.files import read_bytes, read_json
+from cdpipe.descriptors import list_checkpoints
 from cdpipe.io.answer import Answer, read_answer, write_failure
 from cdpipe.io.session import is_session
-from cdpipe.model.config import PipelineConfig, Site
+from cdpipe.model.config import WEIGHTS_FILES, PipelineConfig, Site
 from eval.core.output import make_writable, new_folder, require_no_links
 from eval.core.provenance import digest, versions
 from eval.core.terminal.progress import RunProgress
 from eval.running.runfolder import write_json
 from eval.scoring.scoring import CaseScore, score_stored
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
-from sim.story import PairMaker, is_story
+from sim.story import PairMaker, is_story, read_story
 
 _NAME = re.compile(r"session-(\d\d)")
 _MARK = "story_report.json"
@@ -73,7 +74,7 @@ def list_sessions(story: Path) -> dict[int, Path]:
     """Return the sessions of a story by their numbers, in order.
 
     Raises:
-        InputError: There is no session 1, or no later one.
+        InputError: There is no session 1, or no later one; or a simulated story lacks a session.
     """
     found = {}
     for path in sorted(story.iterdir()) if story.is_dir() else ():
@@ -85,6 +86,8 @@ def list_sessions(story: Path) -> dict[int, Path]:
             f"{story}: expected session-01 and later sessions, as `tunnelcd simulate --sessions 3 ...` writes them; "
             "recorded sessions may stand there under such names, too"
         )
+    if is_story(story) and (missing := set(range(1, len(read_story(story).sessions) + 1)) - set(found)):
+        raise InputError(f"{story}/session-{min(missing):02d}: missing, or damaged: simulate the story again")
     return found
 
 
@@ -146,14 +149,16 @@ def _claim(out: Path, story: Path, sessions: dict[int, Path], method: Method) ->
         "tool": "tunnelcd story",
         "story": {f"{number:02d}": _digest_session(path) for number, path in sessions.items()},
         "preset": method.preset,
-        "config": digest(method.config.model_dump(mode="json")),
+        "config": digest(method.config.model_dump(mode="json", exclude=WEIGHTS_FILES)),
+        # the digests name the weights, wherever their files lie
+        "checkpoints": list_checkpoints(method.config),
     }
     mark = out / _MARK
     if mark.is_file():
         require_no_links(out)
         found = read_json(mark, "written by `tunnelcd story`")
         if {name: found.get(name) for name in wanted} != wanted:
-            differing = "story" if found.get("story") != wanted["story"] else "method or settings"
+            differing = "story" if found.get("story") != wanted["story"] else "method, settings or weights"
             raise InputError(f"{out}: is the report of another {differing} than {story}: name a new folder")
         return
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

@@ -35,6 +35,7 @@ from eval.scoring.region_metrics import label_keyframes, transform_to_map
 from eval.truth.adapters import held_input
 from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth, ground_truth
 from eval.truth.scoring_points import ScoringPointsBuilder
+from scenarios.grafted import GraftScenario
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario, SessionPlan
@@ -159,6 +160,7 @@ def _make_pair_shard(
         "score_radius_m": told.score_radius_m,
         "changes": [{"name": change.name, "prop_kind": change.prop_kind} for change in told.changes],
         "counts": _count_arrays(arrays),
+        **({"is_recorded": True} if isinstance(scenario, GraftScenario) else {}),
     }
     return encode_shard(arrays, about)
 

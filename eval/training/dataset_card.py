@@ -1,7 +1,7 @@
 """Index, data card, digests and metadata of a folder of shards: index.csv, README.md, SHA256SUMS, croissant.json.
 
-index.csv has one row per tunnel. All are made from the shards in the folder, so that they are right after an
-interrupted run as well.
+index.csv has one row per shard, and one per tunnel that cannot be built. All are made from the shards in the folder, so
+that they are right after an interrupted run as well.
 """
 
 from __future__ import annotations
@@ -27,7 +27,12 @@ COUNTS = ("n_before", "n_after", "n_covered", "n_positive", "n_negative", "n_cha
 INDEX_COLUMNS = (
     "family", "seed", "split", "status", "shard", *COUNTS, "score_radius_m", "bytes", "sha256", "digest", "reason",
 )  # fmt: skip
-_DESCRIPTION = "Simulated tunnels, each driven twice by a ray-cast LiDAR, as training data of change descriptors"
+_SIMULATED = "Simulated tunnels, each driven twice by a ray-cast LiDAR"
+_RECORDED = "Tunnels, some of them recorded and others simulated, each driven twice by a LiDAR"
+_PURPOSE = "as training data of change descriptors"
+_LICENCE_OF_RECORDINGS = "that of the recordings, which their owners give; what tunnelcd simulated is MIT"
+_MIT = "MIT, as tunnelcd itself: everything is simulated, nothing was recorded"
+_ROW = "One row is one shard, or a tunnel that cannot be built."
 _ENCODING = "application/octet-stream"
 _TYPES = {**dict.fromkeys((*COUNTS, "seed", "bytes"), "whole"), "score_radius_m": "number"}
 _MEANINGS = {
@@ -59,13 +64,23 @@ def write_card(out: Path) -> None:
     document = read_json(out / "dataset.json", "expected a folder made by `tunnelcd dataset`")
     with whole_file(out / "README.md") as partial:
         partial.write_text(card(rows, document["recipe"], document["commands"]), encoding="utf-8")
-    table = Table("index.csv", digest_file(out / "index.csv"), "One row is one tunnel.", _COLUMNS)
+    table = Table("index.csv", digest_file(out / "index.csv"), _ROW, _COLUMNS)
     shards = FileGroup("shards", "the arrays of one tunnel each, as README.md lists them", _ENCODING, f"*{SUFFIX}")
     version = version_name().removeprefix("tunnelcd ")
-    write_croissant(out, describe_croissant("tunnelcd-training", _DESCRIPTION, version, (shards,), table))
+    told = f"{_what(rows)}, {_PURPOSE}"
+    licence = {"licence": _LICENCE_OF_RECORDINGS} if _has_recordings(rows) else {}
+    write_croissant(out, describe_croissant("tunnelcd-training", told, version, (shards,), table, **licence))
     digests = {row["shard"]: row["sha256"] for row in rows if row["status"] == "ok"}
     digests |= {name: digest_file(out / name) for name in ("README.md", "dataset.json", "index.csv", FILE)}
     write_sums_of(out, [f"{digest}  {name}\n" for name, digest in sorted(digests.items())])
+
+
+def _has_recordings(rows: Sequence[Row]) -> bool:
+    return any(row.get("is_recorded", False) for row in rows)
+
+
+def _what(rows: Sequence[Row]) -> str:
+    return _RECORDED if _has_recordings(rows) else _SIMULATED
 
 
 def fields_table() -> str:
@@ -93,7 +108,7 @@ def card(rows: Sequence[Row], recipe: Mapping[str, Any], commands: Sequence[str]
     one = "One shard is one tunnel" + (" with one of its after sessions" if "afters" in recipe else "")
     return f"""# Training data of change descriptors, made by `tunnelcd dataset`
 
-Simulated tunnels, each driven twice by a ray-cast Ouster OS1-32; between the drives, objects are added, removed or
+{_what(rows)}; between the drives, objects are added, removed or
 moved.
 {one}, and a tunnel is of one split: seeds below 10000 train, 10000 to 19999 validate, 20000 to 29999
 test and are never trained on.
@@ -112,7 +127,7 @@ score radius of an observable change, negative beyond 1.5 radii of every change,
 {_afters_row(made, recipe)}| digest of all shards | `{digest_of(made)}` |
 | bytes | {sum(row["bytes"] for row in made):,} |
 | version | {version_name()} |
-| licence | MIT, as tunnelcd itself: everything is simulated, nothing was recorded |
+| licence | {_LICENCE_OF_RECORDINGS if _has_recordings(rows) else _MIT} |
 
 ## Tunnels that could not be built
 
@@ -136,7 +151,7 @@ pairs = ChangePairs(tunnels)                                # a torch Dataset of
 tensors = stacked(tunnels, ("before_images", "after_images", "labels"))    # all in memory
 ```
 
-`index.csv` has one row for each tunnel. A shard is a safetensors file:
+`index.csv` has one row for each shard, and one for each tunnel that cannot be built. A shard is a safetensors file:
 
 {fields_table()}
 
@@ -202,6 +217,7 @@ def _shard_row(path: Path) -> Row:
         return {
             **{name: about[name] for name in ("family", "seed", "digest", "score_radius_m")},
             **{name: about["counts"][name] for name in COUNTS},
+            "is_recorded": about.get("is_recorded", False) is True,
             "split": split_of(about["seed"]),
             "status": "ok",
             "shard": path.name,

@@ -22,7 +22,7 @@ from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.whole_file import whole_file
 from cdpipe.training.shard import FORMAT, FORMAT_VERSION, SUFFIX, read_about
 from eval.core.cluster import HERE, Where, connected, n_slots, require_usable
-from eval.core.output import make_writable
+from eval.core.output import make_writable, only_writer
 from eval.core.terminal.interrupts import raise_lost_interrupt
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.plans.seeds import parse_seeds_option
@@ -95,15 +95,34 @@ def make_dataset(
         progress: Receives each tunnel and its number of keyframe pairs.
 
     Raises:
-        InputError: A family, the seeds, the folder or the scheduler is wrong.
+        InputError: A family, the seeds, the folder or the scheduler is wrong; or another process fills the folder.
     """
     progress = progress or Silent()
     require_usable(where)
     tunnels = _tunnels(families, seeds, recipe)
-    was_there, is_new = out.exists(), not (out / "dataset.json").is_file()
+    was_there = out.exists()
+    make_writable(out)
+    with only_writer(out, "tunnelcd dataset"):
+        return _make_in(out, tunnels, recipe, where, limit, command, progress, was_there=was_there)
+
+
+def _make_in(
+    out: Path,
+    tunnels: Sequence[Tunnel],
+    recipe: Recipe,
+    where: Where,
+    limit: int | None,
+    command: str,
+    progress: RunProgress,
+    *,
+    was_there: bool,
+) -> DatasetOutcome:
+    is_new = not (out / "dataset.json").is_file()
     _take_folder(out, recipe, command)
     missing = [tunnel for tunnel in tunnels if not _is_done(out, tunnel, recipe.afters)]
-    todo = missing[:limit]
+    # a limit is of tunnels that are made: those that are refused at once take no time
+    todo = [tunnel for tunnel in missing if tunnel.refused]
+    todo += [tunnel for tunnel in missing if not tunnel.refused][:limit]
     start, n_pairs = time.perf_counter(), []
     if todo:
         progress.cells("the first tunnel", 0, len(todo))
@@ -154,8 +173,7 @@ def _tunnel(family: str, seed: int, recipe: Recipe) -> Tunnel:
 
 
 def _take_folder(out: Path, recipe: Recipe, command: str) -> None:
-    """Make the folder, or check that it has the same recipe, and add the command to its list."""
-    make_writable(out)
+    """Mark an empty folder, or check that it has the same recipe, and add the command to its list."""
     path = out / "dataset.json"
     present = {"format": FORMAT, "format_version": FORMAT_VERSION, "recipe": json.loads(json.dumps(recipe.document()))}
     commands: list[str] = []

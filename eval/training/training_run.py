@@ -13,6 +13,7 @@ from typing import Any
 import pandas as pd
 import torch
 
+from cdpipe.core.errors import InputError
 from cdpipe.core.whole_file import whole_file
 from cdpipe.descriptors import use_threads
 from cdpipe.descriptors.change_network import make_untrained_change_network
@@ -66,6 +67,8 @@ def train_descriptor(
     Raises:
         InputError: The folder lacks a split, is damaged, `out` holds another run, or no GPU can be used.
     """
+    if (out / "dataset.json").exists():
+        raise InputError(f"{out}: holds training data, and weights among them would be taken for it: name a new folder")
     use_threads(threads)
     place = find_device(device)
     tunnels = open_dataset(data, "train"), open_dataset(data, "validation")

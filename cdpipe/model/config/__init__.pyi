@@ -9,7 +9,7 @@ from .comparison import (
 )
 from .mapping import DescriptorConfig, MapConfig, MergeConfig, SphereConfig
 from .pipeline import OF_WHOLE_MAPS, PipelineConfig, setting_fields, settings_table
-from .presets import WEIGHTS, Site, load_config, preset_files, preset_names
+from .presets import WEIGHTS, WEIGHTS_FILES, Site, load_config, preset_files, preset_names
 from .surface import SurfaceConfig
 from .whole_maps import ErasorConfig, M3C2Config, M3C2EPConfig, RangeNetConfig
 
@@ -17,6 +17,7 @@ __all__ = [
     "OF_WHOLE_MAPS",
     "SOURCES_AT_KEYFRAMES",
     "WEIGHTS",
+    "WEIGHTS_FILES",
     "WHOLE_MAP_SOURCES",
     "ClusterConfig",
     "DescriptorConfig",

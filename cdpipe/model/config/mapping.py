@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from cdpipe.core.yamlfile import GrownSettings
 from cdpipe.model.config.values import Cell, Count, Positive, Share
@@ -41,6 +41,15 @@ class DescriptorConfig(GrownSettings):
     precision: Literal["float32", "int8"] = Field("float32", description="of stored sphere descriptors")
     weights: str = Field("", description="`3deg`: file of weights that `tunnelcd train` wrote; empty: the shipped ones")
     device: Literal["cpu", "cuda"] = Field("cpu", description="`3deg`: where the network computes; `cuda`: a GPU")
+
+    @model_validator(mode="after")
+    def _uses_weights(self) -> DescriptorConfig:
+        if self.weights and self.method != "3deg":
+            raise ValueError(
+                f"descriptor.weights = {self.weights}: descriptor.method = {self.method} has no weights of its own: "
+                "expected 3deg"
+            )
+        return self
 
 
 class SphereConfig(GrownSettings):

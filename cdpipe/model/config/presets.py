@@ -25,6 +25,8 @@ from cdpipe.model.config.pipeline import PipelineConfig
 
 Site = Literal["narrow", "wide"]
 WEIGHTS = ("descriptor.weights", "sphere.weights", "range_net.weights")
+# The same, as `model_dump` excludes them.
+WEIGHTS_FILES = {setting.partition(".")[0]: {"weights"} for setting in WEIGHTS}
 """Settings that name a file; a relative path starts at the file that holds the setting."""
 
 

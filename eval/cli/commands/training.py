@@ -49,8 +49,10 @@ def dataset(
     world: WorldSettings = None,
     settings: OldWorldSettings = None,
     draws: Annotated[int, typer.Option(min=1, help="after images of each keyframe; the first is merged exactly")] = 4,
-    error_m: Annotated[float, typer.Option(min=0, help="merge error of the other draws: translation, 1 sigma")] = 0.03,
-    error_deg: Annotated[float, typer.Option(min=0, help="rotation, 1 sigma per component")] = 0.2,
+    error_m: Annotated[
+        float, typer.Option(min=0, max=10, help="merge error of the other draws: translation, 1 sigma")
+    ] = 0.03,
+    error_deg: Annotated[float, typer.Option(min=0, max=180, help="rotation, 1 sigma per component")] = 0.2,
     afters: Annotated[int, typer.Option(min=1, max=12, help="after sessions of each tunnel, one shard each")] = 1,
     release: Annotated[
         str | None,
@@ -145,7 +147,7 @@ def train(
     out: Annotated[Path, typer.Option("--out", help="folder for checkpoint, model card and curves")],
     descriptor: Annotated[str, typer.Option(help="sphere, 3deg, or the network of range-net")] = "sphere",
     steps: Annotated[int, typer.Option(min=1, help="largest number of training steps")] = 4000,
-    seed: Annotated[int, typer.Option(min=0, help="seed of the initial weights and of every draw")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**64 - 1, help="seed of the initial weights and of every draw")] = 0,
     threads: Annotated[int, typer.Option(min=1, help="number of torch's threads; another gives other weights")] = 2,
     patience: Annotated[int, typer.Option(min=1, help="stop after this many validations without a better score")] = 6,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="where the network computes; cuda: a GPU")] = "cpu",
@@ -162,5 +164,7 @@ def train(
     with shown_progress(quiet) as progress:
         config = FitConfig(seed, steps, patience=patience)
         checkpoint, card = train_descriptor(data, out, descriptor, config, threads, command, progress, device)
+    if card["validation"].get("calibration", {}).get("slope") == 0:
+        warn("the network ranks the validation tunnels no better than chance: train it on more tunnels, or longer")
     scores = ", ".join(f"{name} {value}" for name, value in card["validation"]["trained"].items())
     say(quiet, f"{checkpoint}: best of step {card['best_step']} on validation tunnels: {scores}")

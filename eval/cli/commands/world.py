@@ -138,6 +138,7 @@ def survey(
     """Build the worlds of families without scanning them; print size, density, changes, repose and roughness."""
     import pandas as pd
 
+    from cdpipe.core.errors import InputError
     from eval.core.output import make_writable
     from eval.plans.seeds import parse_seeds_option
     from sim.studies import survey as surveys
@@ -149,6 +150,9 @@ def survey(
         make_writable(out.absolute().parent)
     with shown_progress(quiet) as progress:
         found = [surveys.survey(family, numbers, workers, progress.cells) for family in families]
+    failures = [failure for one in found for failure in one.failures]
+    if failures and not any(one.worlds for one in found):
+        raise InputError("\n".join(dict.fromkeys(f"{failure.family}: {failure.reason}" for failure in failures)))
     if out is not None:
         write_csv(out, found)
     if markdown:
@@ -156,7 +160,6 @@ def survey(
     elif not quiet:
         table = pd.DataFrame([summary(one) for one in found]).T.reset_index()
         print_table("figures", table.iloc[1:].set_axis(["", *families], axis=1), LINE)
-    failures = [failure for one in found for failure in one.failures]
     for failure in failures:
         echo(f"failed: {failure.family}, seed {failure.seed}: {failure.reason}")
     n_worlds = sum(len(one.worlds) for one in found)

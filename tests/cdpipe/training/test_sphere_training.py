@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from cdpipe.core.errors import InputError
 from cdpipe.descriptors.sphere_image import COLUMNS, REACH_M, ROWS
 from cdpipe.descriptors.sphere_network import SECTORS, make_untrained_sphere_network
 from cdpipe.training import sphere_training
@@ -167,3 +168,18 @@ def test_classes_that_are_wholly_apart_get_a_curve() -> None:
     slope, offset, _ = fit_platt(np.array([-4.0, -3.0, 2.0, 3.0]), np.array([0, 0, 1, 1], dtype=np.bool_))
     assert 0.1 < slope < 5
     assert -3.0 < -offset / slope < 2.0
+
+
+def test_a_ranking_the_wrong_way_round_earns_no_curve() -> None:
+    scores, labels = np.array([-2.0, -1.5, 1.0, 2.0, 0.1]), np.array([1, 1, 0, 0, 0], dtype=np.bool_)
+    slope, _, likelihood = fit_platt(scores, labels)
+    assert slope == pytest.approx(0.0, abs=1e-6)
+    assert likelihood < fit_platt(-scores, labels)[2]
+
+
+def test_validation_without_both_classes_is_refused() -> None:
+    data = _walls(12, {0: (6, 3), 4: (5, 11), 7: (8, 6)})
+    for label in (0, 1):
+        alone = replace(data, labels=np.full_like(data.labels, label))
+        with pytest.raises(InputError, match="make more validation tunnels"):
+            SphereTask(make_untrained_sphere_network(), data, alone, seed=0)

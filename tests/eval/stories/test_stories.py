@@ -12,9 +12,11 @@ import pytest
 
 import cdpipe
 from cdpipe.core.errors import InputError, MergeFailedError
+from cdpipe.descriptors.sphere_network import make_untrained_sphere_network
+from cdpipe.descriptors.weights_file import checkpoint_bytes
 from cdpipe.io.session import read_session
 from cdpipe.model.report import ChangedObject, ChangeReport
-from eval.stories.comparisons import Method
+from eval.stories.comparisons import Method, list_sessions
 from eval.stories.places import choose_places, follow_places
 from eval.truth.ground_truth import load_ground_truth
 from scenarios.schema import (
@@ -205,7 +207,7 @@ def test_a_folder_of_another_story_or_method_is_refused(
     oracle.stop = {"session-02": KeyboardInterrupt()}
     assert command("story", told[0], "--out", oracle.out, "-q")[0] == 130
     code, _, err = command("story", told[0], "--out", oracle.out, "--set", "surface.radius_m=0.7")
-    assert code == 2 and "is the report of another method or settings" in err
+    assert code == 2 and "is the report of another method, settings or weights" in err
     code, _, err = command("story", tmp_path, "--out", tmp_path / "other")
     assert code == 2 and "expected session-01 and later sessions" in err
 
@@ -225,3 +227,24 @@ def test_places_of_one_region_are_chosen_once() -> None:
         Method("no-such-preset", "narrow", ()).config  # noqa: B018
     assert choose_places([], [np.array([1.0, 2.0, 3.0])])[0].name == "P1"
     assert follow_places([], []).empty
+
+
+def test_answers_of_other_weights_are_never_mixed(
+    told: tuple[Path, Story], oracle: Oracle, command: Command, tmp_path: Path
+) -> None:
+    weights = tmp_path / "w.safetensors"
+    argv = ("story", told[0], "--out", oracle.out, "--set", f"sphere.weights={weights}", "-q")
+    weights.write_bytes(checkpoint_bytes(make_untrained_sphere_network(1)))
+    oracle.stop = {"session-03": KeyboardInterrupt()}
+    assert command(*argv)[0] == 130
+    weights.write_bytes(checkpoint_bytes(make_untrained_sphere_network(2)))
+    code, _, err = command(*argv)
+    assert code == 2 and "is the report of another method, settings or weights" in err
+
+
+def test_a_story_that_lost_a_session_is_refused(told: tuple[Path, Story], tmp_path: Path) -> None:
+    lost = tmp_path / "lost"
+    shutil.copytree(told[0], lost)
+    shutil.rmtree(lost / "session-02")
+    with pytest.raises(InputError, match=r"session-02: missing, or damaged: simulate the story again"):
+        list_sessions(lost)

@@ -49,3 +49,12 @@ def test_metadata_of_shards_are_valid_and_list_refused_tunnels(tmp_path: Path) -
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.splitlines()[0].split()[0]) == (0, "3"), done.stderr
     assert len(done.stdout.splitlines()) == 2
+
+
+def test_data_with_recordings_are_not_given_away_as_simulated() -> None:
+    row = {"family": "a", "seed": 2, "status": "ok", "split": "train", "shard": "s", "sha256": "0", "bytes": 1}
+    row |= dict.fromkeys(("n_before", "n_covered", "n_positive", "n_negative", "n_changes", "n_observable"), 1)
+    recipe = {"settings": [], "draws": 1, "error_m": 0.0, "error_deg": 0.0}
+    assert "| licence | MIT, as tunnelcd itself: everything is simulated" in card([row], recipe, [])
+    told = card([row, {**row, "is_recorded": True}], recipe, [])
+    assert "| licence | that of the recordings" in told and "everything is simulated" not in told

@@ -29,6 +29,7 @@ from cdpipe.training.data import open_dataset, read_place_data
 from cdpipe.training.shard import FIELDS, encode_shard, read_about, read_shard
 from eval.core import cluster
 from eval.core.cluster import Where
+from eval.core.output import only_writer
 from eval.oracles.merge import OracleMerge, merged_by_truth
 from eval.scoring.merge_metrics import PAIR_RADIUS_M
 from eval.training import dataset_run
@@ -443,3 +444,34 @@ def test_a_run_that_is_interrupted_goes_on_where_it_stopped(
     fake_shards(monkeypatch, shard)
     assert make_dataset([FAMILY], "3:6", RECIPE, tmp_path / "d").n_made == n_left
     assert not list((tmp_path / "d").glob(".*"))
+
+
+def test_a_limit_is_of_tunnels_that_are_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shard: Shard) -> None:
+    made = fake_shards(monkeypatch, shard)
+    monkeypatch.setattr(dataset_run, "_tunnel", refuse_even)
+    first = make_dataset([FAMILY], "0:6", RECIPE, tmp_path / "d", limit=1)
+    assert (first.n_made, first.n_refused, first.n_left, made) == (1, 3, 2, [1])
+    assert make_dataset([FAMILY], "0:6", RECIPE, tmp_path / "d", limit=1).n_left == 1
+    assert made == [1, 3]
+
+
+def refuse_even(family: str, seed: int, recipe: Recipe) -> dataset_run.Tunnel:
+    if seed % 2 == 0:
+        return dataset_run.Tunnel(family, seed, refused="no such sensor")
+    return dataset_run.Tunnel(
+        family, seed, dataset_run.shard_digest(load_scenario(family, seed, recipe.settings), seed, recipe)
+    )
+
+
+def test_a_second_command_in_the_folder_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shard: Shard
+) -> None:
+    fake_shards(monkeypatch, shard)
+    (tmp_path / "d").mkdir()
+    with (
+        only_writer(tmp_path / "d", "tunnelcd dataset"),
+        pytest.raises(InputError, match="another `tunnelcd dataset`"),
+    ):
+        make_dataset([FAMILY], "0:1", RECIPE, tmp_path / "d")
+    assert list((tmp_path / "d").iterdir()) == []
+    assert make_dataset([FAMILY], "0:1", RECIPE, tmp_path / "d").n_made == 1

@@ -158,6 +158,8 @@ def test_mistakes_are_one_line(data: Path, tmp_path: Path, command: Command) -> 
     assert "expected sphere or 3deg" in refused(data, "--out", tmp_path / "a", "--descriptor", "spere")
     assert "made by `tunnelcd dataset`" in refused(tmp_path, "--out", tmp_path / "b")
     assert not (tmp_path / "b").exists()
+    assert "holds training data" in refused(data, "--out", data)
+    assert "--seed" in command("train", data, "--out", tmp_path / "d", "--seed", 2**64)[2]
     training = tmp_path / "training"
     shutil.copytree(data, training)
     rows = (training / "index.csv").read_text().splitlines()
