@@ -66,6 +66,12 @@ class SurfaceChange(Settings):
         refuse_other_keys(self, USUAL_SURFACES, f"surface {self.name!r}")
         if self.sector_deg is not None and not 5 <= self.sector_deg[1] - self.sector_deg[0] <= 360:
             raise ValueError(f"surface {self.name!r}: sector_deg: from and to are 5 to 360 degrees apart, from first")
+        if (
+            self.kind == "heave"
+            and self.sector_deg is not None
+            and not 90 <= self.sector_deg[0] < self.sector_deg[1] <= 270
+        ):
+            raise ValueError(f"surface {self.name!r}: sector_deg of a heave: the floor lies between 90 and 270 degrees")
         if self.kind == "face" and (self.place.between or self.place.area):
             raise ValueError(f"surface {self.name!r}: a face is at a node, the blind end of a drift")
         if self.place.node is not None and self.kind not in ("face", "fill"):

@@ -14,6 +14,7 @@ from sim.displacement.normals import smooth_normals
 from sim.displacement.refine import TwinWalls, refine, swept_volume_m3
 from sim.displacement.zone import Around, Zone, sector_offset
 from sim.geometry.noise import noise_at
+from sim.geometry.raycast import Caster
 
 REPOSE_DEG = 37.0  # of blasted rock: sim/props/MUCK_PILES.md
 _FINE_M = 0.06
@@ -33,10 +34,15 @@ _FILL_SLOPE = 1 / 3  # a ramp that a robot climbs
 _FILL_ROUGH = ((0.03, 1.2), (0.012, 0.25))  # standard deviation and correlation length, metres
 _FILL_EDGE_M = 0.12
 _HALVINGS = 40
+_BEHIND_M = 0.05
 
 
 def break_out(walls: TwinWalls, zone: Zone, change: SurfaceChange, seed: int) -> Moved:
-    """Take rock out of wall or roof: `depth_m` deep about the middle, irregular, with a sharp rim."""
+    """Take rock out of wall or roof: `depth_m` deep about the middle, irregular, with a sharp rim.
+
+    Raises:
+        ScenarioError: It would break into another drift.
+    """
     assert change.depth_m is not None and change.sector_deg is not None
     sector_deg, depth_m = change.sector_deg, change.depth_m
     rim_key, *keys = stream(seed, "surface", change.name, "scar").integers(2**63, size=1 + len(_BROKEN)).tolist()
@@ -59,7 +65,12 @@ def break_out(walls: TwinWalls, zone: Zone, change: SurfaceChange, seed: int) ->
     )
     hollow = np.maximum(1.0 - 0.4 * (1.0 - np.clip(inside, 0, 1)) ** 2 + broken, _LEAST)
     depths_m = depth_m * np.clip(inside / _RIM, 0.0, 1.0) * hollow
-    return Moved(walls, chosen, places - depths_m[:, None] * smooth_normals(walls, chosen, _BODY_M))
+    outward = -smooth_normals(walls, chosen, _BODY_M)
+    ahead_m, _, normals = Caster([walls.mesh("before")]).hits(places + _BEHIND_M * outward, outward)
+    # a wall that is met from behind is another drift's
+    if (((normals * outward).sum(axis=1) > 0) & (ahead_m + _BEHIND_M < depths_m)).any():
+        raise ScenarioError(f"surface {change.name!r}: another drift lies behind the rock that falls out {zone.where}")
+    return Moved(walls, chosen, places + depths_m[:, None] * outward)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -155,8 +155,8 @@ def rubble_points(displacement: Displacement, higher_m: float) -> list[tuple[str
 
 
 def raise_centreline(centreline: Centreline, walls: Caster, displacement: Displacement) -> Centreline:
-    """Return the centreline on the floor of the after session, where fill and heave raised it."""
-    is_raised = displacement.owned_by({"heave", "fill"})
+    """Return the centreline on the floor of the after session, where rock raised it."""
+    is_raised = displacement.owned_by({"convergence", "heave", "shotcrete", "fill"})
     if not is_raised.any():
         return centreline
     tree = cKDTree(displacement.walls.before)

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from cdpipe.core.geometry import Float64Array
 from sim.rock.centreline import DriftLine, left_of
 
-# Rock farther from the axis than this many sizes of the drift is another drift's; windows fade out before it.
+# Rock farther from the axis than this many sizes of the drift does not move; windows fade out before it.
 _FADE_FROM, _FADE_TO = 0.8, 1.2
 _FLAT = 0.5  # share of a window over which it is 1
 _MARGIN_M = 4.0
@@ -25,7 +25,7 @@ class Around:
         left_m: Distance to the left of the axis.
         up_m: Height above the floor of the centreline.
         angle_deg: About the axis, half the drift's height up: 0 the crown, 90 the left wall, +-180 the floor.
-        share: 1 on this drift's rock, fading to 0 on rock so far away that it belongs to another one.
+        share: 1 on rock near the axis, fading to 0 beyond; another drift that near moves as well.
     """
 
     along_m: Float64Array

@@ -11,6 +11,7 @@ from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Arr
 from sim.geometry.raycast import Caster
 from sim.graft.noise import RangeNoise, find_bins
 from sim.graft.part import Part, RecordedRevolution
+from sim.sensor.optics import range_channel
 from sim.sensor.rays import Rays, revolution_rays
 from sim.session.truth import Int16Array
 
@@ -87,7 +88,7 @@ def graft_revolution(
     instance[gone] = NO_RETURN
     kept, where = ~is_lost, (target[~is_lost], column[~is_lost])
     measured_m = met_m[kept] + noise.draw(met_m[kept], numbers[1][kept]) + sensor.beam_origin_m
-    channels[0][where] = np.maximum(np.rint(measured_m * 1000.0 / noise.step_mm), 1) * noise.step_mm
+    channels[0][where] = np.maximum(range_channel(measured_m, noise.step_mm), noise.step_mm)
     bright = noise.intensity[find_bins(met_m[kept]), (numbers[2][kept] * noise.intensity.shape[1]).astype(np.int64)]
     channels[1][where], channels[2][where] = bright.T
     instance[where] = props.instance[geom[row, column][kept]]

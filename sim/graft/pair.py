@@ -192,7 +192,7 @@ def _graft_revolutions(
     for recorded in part.revolutions():
         revolution, truth = recorded, None
         if graft.rock:
-            revolution, truth = move_rock(part, recorded, graft.rock, graft.steps_mm[number], counts.rock)
+            revolution, truth = move_rock(part, recorded, graft.rock, graft.steps_mm[number], counts.rock, graft.seed)
         made = graft_revolution(part, revolution, props, noise, graft.seed)
         counts.add(made)
         surface = None if truth is None else truth.on_rock(made.instance == 0)

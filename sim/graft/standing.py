@@ -82,6 +82,9 @@ def _find_place(
             rest = shape_of(item.prop, seed, loaded_share=item.prop.loaded_share)
             items.append(replace(items[0], shape=rest, sessions=frozenset(("after",))))
         return items
+    if place.at is not None:
+        where = f"{purpose}.at = {list(place.at)}"
+        raise ScenarioError(f"prop {item.prop.name!r} cannot stand at {where}: {next(iter(reasons))}")
     told = ", ".join(f"{number} times {why}" for why, number in sorted(reasons.items(), key=lambda each: -each[1]))
     raise ScenarioError(
         f"prop {item.prop.name!r} finds no place in {sum(reasons.values())} tries ({told}): make it smaller, "

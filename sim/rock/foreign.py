@@ -14,7 +14,7 @@ from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, Int64Array
 from scenarios.schema import MeshFile
 from sim.geometry.mesh import Mesh, drop_flat_faces, drop_unused_vertices
-from sim.geometry.topology import closed_volume_m3, edges_of, largest_hole, void_winding
+from sim.geometry.topology import Edges, closed_volume_m3, edges_of, largest_hole, void_winding
 from sim.rock.glb import count_glb
 
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
@@ -87,12 +87,21 @@ def refuse_tunnel(mesh: Mesh, file: MeshFile) -> None:
             f"{_length(around_m)} around, is at {_place(middle)}: close it, "
             f"or let rays leave with {key}.allow_open: true"
         )
-    if len(wrong := edges.disagreeing):
+    refuse_disagreeing(mesh, file, edges)
+    _refuse_facing_rock(mesh, file, key)
+
+
+def refuse_disagreeing(mesh: Mesh, file: MeshFile, edges: Edges | None = None) -> None:
+    """Refuse a surface some of whose faces are turned.
+
+    Raises:
+        ScenarioError: One line with the way out.
+    """
+    if len(wrong := (edges or edges_of(mesh)).disagreeing):
         raise ScenarioError(
-            f"{key}: {file.path}: at {len(wrong)} edges the two faces do not face the same way, first at "
+            f"{TUNNEL_KEY}: {file.path}: at {len(wrong)} edges the two faces do not face the same way, first at "
             f"{_place(mesh.vertices[wrong[0]].mean(axis=0))}: make its normals consistent and export it again"
         )
-    _refuse_facing_rock(mesh, file, key)
 
 
 def prop_mesh(file: MeshFile, name: str) -> Mesh:

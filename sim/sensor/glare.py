@@ -23,6 +23,7 @@ GLARE = -5  # number of the geom of a return from stray light
 # followed. Ours, unverified: no figure for this sensor was found; so chosen that a plate of 0.4 m at 6 m blinds what is
 # less than its own size beside it.
 STRAY_AT_1_DEG, REACH_DEG = 3e-4, 4.0
+_STEEPEST_DEG = 85.0
 # Of the beams that stray light outshines, how many report it; the vendor's firmware suppresses most of it since 1.12
 # (ouster-sdk issue 61). Ours, unverified.
 REPORTED_SHARE = 0.2
@@ -107,5 +108,8 @@ def _spread_light(echo: Echo, is_source: BoolArray, rays: Rays, sensor: SensorMe
 def _neighbours(sensor: SensorMetadata) -> tuple[Int64Array, Int64Array]:
     """Return how many rows (R,) and columns of one direction (C,) stray light may reach."""
     step_deg = float(np.abs(np.diff(sensor.altitude_deg)).min()) if sensor.height > 1 else REACH_DEG
-    rows, columns = int(REACH_DEG / max(step_deg, 0.1)), int(REACH_DEG * sensor.width / 360.0)
+    # columns stand closer together on steep beams
+    steepest = np.deg2rad(min(float(np.abs(sensor.altitude_deg).max()) + REACH_DEG, _STEEPEST_DEG))
+    rows = int(REACH_DEG / max(step_deg, 0.1))
+    columns = min(int(REACH_DEG * sensor.width / 360.0 / np.cos(steepest)) + 1, (sensor.width - 1) // 2)
     return np.arange(-rows, rows + 1), np.arange(-columns, columns + 1)

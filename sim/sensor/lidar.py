@@ -222,7 +222,9 @@ def _measure(echo: Echo, settings: Sensor, purpose: tuple[int, str, str], number
         noise = stream(seed, session, f"{prefix}range-noise", str(number)).standard_normal(shape, dtype=np.float32)
         noise *= range_sigma_m(range_m, photons, echo.cosine)
         range_m = range_m + noise
-    is_return = (echo.geom != MISS) & (range_m >= settings.min_range_m) & (range_m <= settings.max_range_m)
+    # a range of 0 says that there is no return
+    least_m = max(settings.min_range_m, settings.range_step_mm / 1000.0)
+    is_return = (echo.geom != MISS) & (range_m >= least_m) & (range_m <= settings.max_range_m)
     if settings.dropouts:
         draw = stream(seed, session, f"{prefix}dropouts", str(number)).random(shape, dtype=np.float32)
         is_return &= draw < detection_probability(photons)
@@ -251,7 +253,8 @@ def _arrange(first: _Return, second: _Return) -> list[_Return]:
 def _report_nothing_there(parts: Sequence[_Return], settings: Sensor, generator: np.random.Generator) -> None:
     """Let some pixels report a return where nothing is, and no second one, in place."""
     first, *others = parts
-    pixels, places_m = false_returns(generator, first.geom.size, settings.min_range_m, settings.max_range_m)
+    least_m = min(max(settings.min_range_m, settings.range_step_mm / 1000.0), settings.max_range_m)
+    pixels, places_m = false_returns(generator, first.geom.size, least_m, settings.max_range_m)
     first.geom.flat[pixels], first.range_m.flat[pixels], first.photons.flat[pixels] = (
         FALSE_RETURN, places_m, FALSE_PHOTONS
     )  # fmt: skip

@@ -94,7 +94,7 @@ def _find_wet(echo: Echo, rays: Rays, beam_origin_m: float, water: Water) -> tup
 
 
 def _look_down(echo: Echo, wet: Int64Array, start_m: Float64Array, cosine: Float64Array, beam_origin_m: float) -> Echo:
-    """Return the echo of what lies under the water of (M,) beams, which is weaker and seems deeper.
+    """Return the echo of what lies under the water of (M,) beams, which is weaker and seems farther away.
 
     Args:
         echo: The echo as if there were no water.
@@ -107,7 +107,9 @@ def _look_down(echo: Echo, wet: Int64Array, start_m: Float64Array, cosine: Float
     reach_m = echo.range_m.ravel()[wet].astype(np.float64) - beam_origin_m
     depth_m = np.where(is_floor, reach_m - start_m, 0.0) * cosine
     path_m = depth_m / np.sqrt(1.0 - (1.0 - cosine**2) / WATER_INDEX**2)
-    passed = (1.0 - mirrored_share(cosine, WATER_INDEX)) ** 2 * np.exp(-2.0 * WATER_ABSORPTION_PER_M * path_m)
+    # light that leaves the water spreads over n^2 times the solid angle
+    passed = ((1.0 - mirrored_share(cosine, WATER_INDEX)) / WATER_INDEX) ** 2
+    passed *= np.exp(-2.0 * WATER_ABSORPTION_PER_M * path_m)
     seems_m = np.where(is_floor, start_m + WATER_INDEX * path_m + beam_origin_m, 0.0)
     return replace_pixels(echo, wet, range_m=seems_m, photons=echo.photons.ravel()[wet] * passed)
 

@@ -103,8 +103,9 @@ def refuse_turned(mesh: Mesh, file: MeshFile, is_sure: bool) -> None:
         # the axes of the world in those of the file, see `sim.rock.foreign`
         names = {"z": ("x", "y"), "y": ("x", "z"), "x": ("z", "y")}[file.up]
         raise ScenarioError(
-            f"{file.path}: lies on its side with {file.up} up: {share[best]:.0%} of its faces face along {names[best]} "
-            f"and {share[2]:.0%} along {file.up}: give --up {names[best]}, or --up {file.up} if it is right"
+            f"{file.path}: lies on its side, or is a shaft or a steep ramp, with {file.up} up: {share[best]:.0%} of "
+            f"its faces face along {names[best]} and {share[2]:.0%} along {file.up}: give --up {names[best]}, or --up "
+            f"{file.up} for a shaft or a ramp"
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -18,6 +19,7 @@ LEAST_STEP_M = 2.5  # a drift needs 2 m between nodes
 _SPUR_WIDTHS = 1.2  # a branch that ends and is no longer than this is the corner of a face, a niche or noise
 _SAME_WIDTHS = 0.75  # junctions nearer than this are one
 _PILLAR_WIDTHS = 2.5  # a loop shorter than this leads round a pillar or a hole of the mesh
+_WHOLE = 0.9  # a skeleton with so many of the cells of the longest one is as good
 _MAJORITY = 27 * 2**3 // 2  # of the votes in `_make_odd`
 Width = Callable[[Float64Array], float]
 
@@ -54,7 +56,7 @@ def find_branches(void: Void, width_at: Width) -> list[Branch]:
         void: The inside.
         width_at: The width of the drift at a point (3,).
     """
-    thin = np.argwhere(skeletonize(_make_odd(void.is_inside))).astype(np.int64)
+    thin = np.argwhere(_thin(_make_odd(void.is_inside))).astype(np.int64)
     if len(thin) < 2:
         return []
     branches = _cut_at_junctions(thin, void.low_m + thin * (void.cell_m / 2))
@@ -63,6 +65,25 @@ def find_branches(void: Void, width_at: Width) -> list[Branch]:
         if len(pruned) == len(branches):
             return pruned
         branches = pruned
+
+
+def _thin(cells: BoolArray) -> BoolArray:
+    """Return the skeleton of cells (X, Y, Z), or of cells that are grown by one along some axes if much more is left.
+
+    Thinning eats a bar whose section is an even number of cells wide and high from its ends, see `_make_odd`. A smooth
+    section at an angle to the grid may still be such a bar, and is none with one more cell.
+    """
+    plain = np.asarray(skeletonize(cells), dtype=np.bool_)
+    least = np.count_nonzero(plain) / _WHOLE
+    longest = plain
+    for axes in (axes for number in (1, 2, 3) for axes in combinations(range(3), number)):
+        grown = cells
+        for axis in axes:
+            grown = grown | np.roll(grown, 1, axis)  # the border is empty
+        found = np.asarray(skeletonize(grown), dtype=np.bool_)
+        if np.count_nonzero(found) > max(least, np.count_nonzero(longest)):
+            longest = found
+    return longest
 
 
 def count_uses(branches: Iterable[Branch]) -> dict[int, int]:

@@ -18,7 +18,7 @@ from sim.geometry.raycast import Caster
 from sim.geometry.topology import edges_of
 from sim.rock.axis import find_nearest
 from sim.rock.centreline import build_centreline
-from sim.rock.foreign import TUNNEL_KEY, read_mesh, refuse_tunnel
+from sim.rock.foreign import TUNNEL_KEY, read_mesh, refuse_disagreeing, refuse_tunnel
 from sim.trace.doubts import is_inside_out, judge_roof, judge_width, refuse_turned, tell_parts, typical_width_m
 from sim.trace.graph import TracedDrift, join_drifts, name_nodes
 from sim.trace.inside import Void, count_cells, find_inside
@@ -115,6 +115,7 @@ class _Walls:
 def _read_walls(file: MeshFile) -> _Walls:
     """Read a mesh and turn it inside out where it faces the rock."""
     mesh = read_mesh(file.model_copy(update={"flip": False, "allow_open": True}), TUNNEL_KEY)
+    refuse_disagreeing(mesh, file)
     caster = Caster([mesh])
     is_flipped = is_inside_out(mesh, caster)
     if is_flipped:

@@ -2,7 +2,7 @@
 
 A return keeps its distance from the smooth surface: its ray, shifted by that distance along the normal, meets the
 smooth surface where the rock of the return is. Between the two places where the shifted ray meets the surface as
-recorded and as moved lies the way that the return goes. Nothing is drawn.
+recorded and as moved lies the way that the return goes. Only how it is rounded to a step of the ranges is drawn.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, invert, transform
+from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int64Array, invert, stream, transform
 from sim.graft.part import Part, RecordedRevolution
 from sim.graft.rock.patch import MARGIN_M, Patch, weigh
 from sim.sensor.rays import Rays, revolution_rays
@@ -78,7 +78,7 @@ class _Returns:
 
 
 def move_rock(
-    part: Part, revolution: RecordedRevolution, patches: Sequence[Patch], step_mm: int, counts: RockCounts
+    part: Part, revolution: RecordedRevolution, patches: Sequence[Patch], step_mm: int, counts: RockCounts, seed: int
 ) -> tuple[RecordedRevolution, RockTruth]:
     """Return a revolution with its returns on moved rock where the session is "after", and the truth of its returns.
 
@@ -88,6 +88,7 @@ def move_rock(
         patches: The rock that moves.
         step_mm: Ranges change by multiples of this.
         counts: Filled meanwhile.
+        seed: Draws how shifts are rounded to steps.
     """
     sensor = part.source.sensor
     rays = revolution_rays(sensor, part.world_T_sensor[revolution.number] @ revolution.sensor_T_column)
@@ -98,7 +99,9 @@ def move_rock(
         if not len(found.row):
             continue
         where, further_m, moved_m, is_change, unknown = _meet(patch, found, is_after=part.name == "after")
-        steps = np.rint(further_m * 1000.0 / step_mm).astype(np.int64) * step_mm
+        # rounded at random, so that the mean of a smooth displacement is right
+        draw = stream(seed, part.name, "graft-rock", f"{revolution.number}-{patch.number}").random(len(further_m))
+        steps = np.floor(further_m * 1000.0 / step_mm + draw).astype(np.int64) * step_mm
         range_mm[where] = np.maximum(range_mm[where].astype(np.int64) + steps, 1).astype(np.uint32)
         truth.displacement[where] = moved_m.astype(np.float32)
         truth.surface_change[where] = np.where(is_change, np.int16(patch.number), np.int16(0))

@@ -108,6 +108,7 @@ def test_a_drawn_place_depends_on_no_other_change_but_in_its_way(make_scenario: 
         ("convergence", {"swell": 1.4}, "a convergence has no swell: leave that out"),
         ("face", {"depth_m": 0.1}, "a face has no depth_m"),
         ("heave", {"sector_deg": (30, 20)}, "from first"),
+        ("heave", {"sector_deg": (-40, 40)}, "the floor lies between 90 and 270 degrees"),
         ("scar", {"place": SurfacePlace(node="b")}, "only a face or fill has place.node"),
     ],
 )
@@ -319,3 +320,15 @@ def test_a_foreign_mesh_is_deformed_the_same_way(make_scenario: Callable[..., Sc
         labelled = pair.sessions[session]
         assert labelled.displacement is not None and labelled.surface_change is not None
         assert np.nanmax(labelled.displacement[labelled.surface_change == 1]) == pytest.approx(0.06, abs=1e-3)
+
+
+def test_a_scar_that_breaks_into_another_drift_is_refused(make_scenario: Callable[..., Scenario]) -> None:
+    def beside(gap_m: float) -> Scenario:
+        nodes = {"a": (0.0, 0.0, 0.0), "b": (20.0, 0.0, 0.0), "c": (20.0, gap_m, 0.0), "d": (0.0, gap_m, 0.0)}
+        drifts = tuple(Drift(nodes=pair) for pair in (("a", "b"), ("b", "c"), ("c", "d")))
+        tunnel = Tunnel(nodes=nodes, drifts=drifts, section=Section(width_m=3.2, height_m=3.0), resolution_m=0.25)
+        return make_scenario(tunnel=tunnel, surface=(change("scar", sector_deg=(60, 100), depth_m=0.9),))
+
+    with pytest.raises(ScenarioError, match=r"^surface 'scar': another drift lies behind the rock that falls out"):
+        moved_walls(beside(4.0))
+    assert moved_walls(beside(9.0)).patches[0].kind == "scar"

@@ -20,7 +20,7 @@ from sim.graft import Recorded, graft_in_memory, graft_pair
 from sim.graft.part import Part
 from sim.graft.plan import Graft, plan_graft
 from sim.graft.rock.heights import fit_heights
-from sim.graft.rock.moving import FLATTEST_DEG
+from sim.graft.rock.moving import FLATTEST_DEG, RockCounts, move_rock
 from sim.sensor.rays import revolution_rays
 from sim.session.simulate import HeldPair
 from sim.session.truth import SESSIONS, read_chunk_labels, read_chunk_surface, read_pair_truth
@@ -268,3 +268,18 @@ def test_a_surface_through_noisy_returns_and_past_a_cable() -> None:
     np.testing.assert_allclose(normals[0], np.array([-0.1, 0, 1]) / np.hypot(0.1, 1), atol=0.03)
     assert off_m[0] == pytest.approx(0.05, abs=0.01)
     assert fit_heights(points[:5], (1.2, 1.0)) is None
+
+
+def test_a_coarse_step_of_ranges_keeps_the_mean_of_a_displacement(planned: Graft) -> None:
+    part = planned.parts[1]
+    fine, coarse = [], []
+    for recorded in part.revolutions():
+        counts = RockCounts(*np.zeros((2, len(planned.rock)), np.int64))
+        for step_mm, found in ((1, fine), (8, coarse)):
+            moved, _ = move_rock(part, recorded, planned.rock, step_mm, counts, planned.seed)
+            found.append((moved.range_mm.astype(np.int64) - recorded.range_mm)[recorded.range_mm > 0])
+    exact, rounded = np.concatenate(fine), np.concatenate(coarse)
+    assert (rounded % 8 == 0).all()
+    plateau = np.abs(exact) > 3
+    assert plateau.sum() > 1000
+    assert rounded[plateau].mean() == pytest.approx(exact[plateau].mean(), abs=0.4)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cdpipe.sensor.ouster import SensorMetadata
+from cdpipe.sensor.ouster import SensorMetadata, load_profile
 from scenarios import load_scenario
 from scenarios.schema import Sensor
 from sim.geometry.mesh import Mesh, box_mesh
@@ -15,8 +15,8 @@ from sim.geometry.raycast import Caster
 from sim.materials import REFLECTIVITY
 from sim.scene import Scene
 from sim.sensor.footprint import Echo, central_echo
-from sim.sensor.glare import GLARE, REACH_DEG, REPORTED_SHARE, STRAY_AT_1_DEG, add_glare
-from sim.sensor.lidar import Scan, scan
+from sim.sensor.glare import GLARE, REACH_DEG, REPORTED_SHARE, STRAY_AT_1_DEG, _neighbours, add_glare
+from sim.sensor.lidar import Scan, _measure, scan
 from sim.sensor.optics import RETRO_FROM, reflected_share
 from sim.sensor.rays import Rays, revolution_rays
 from sim.session.planning import plan_drives
@@ -165,3 +165,30 @@ def test_a_family_with_markers_keeps_the_world_of_its_clean_twin() -> None:
         mine, theirs = (each.scene.meshes[each.scene.parts.index(name)] for each in (ours, twin))
         np.testing.assert_array_equal(mine.vertices, theirs.vertices)
     np.testing.assert_array_equal(ours.trajectory.world_T_sensor, twin.trajectory.world_T_sensor)
+
+
+def test_all_beams_within_reach_of_a_steep_one_are_looked_at() -> None:
+    steep = load_profile("os0-128-nominal")
+    rows, columns = _neighbours(steep)
+    ways = still(steep).directions.astype(np.float64)
+    top = int(np.argmax(np.abs(steep.altitude_deg)))
+    column = 100
+    facing = ways @ ways[column, top]
+    lit = np.argwhere(np.degrees(np.arccos(np.clip(facing, -1, 1))) <= REACH_DEG)
+    shift = np.asarray(steep.pixel_shift)
+    step_row = lit[:, 1] - top
+    off = (lit[:, 0] - column - shift[top] + shift[lit[:, 1]] + steep.width // 2) % steep.width - steep.width // 2
+    assert len(lit) > 100
+    assert set(step_row.tolist()) <= set(rows.tolist()) and set(off.tolist()) <= set(columns.tolist())
+
+
+@pytest.mark.parametrize(("range_m", "step_mm", "is_return"), [(0.004, 8, False), (0.009, 8, True), (0.0004, 1, False)])
+def test_a_range_that_rounds_to_none_is_no_return(
+    sensor: SensorMetadata, range_m: float, step_mm: int, is_return: bool
+) -> None:
+    echo = bare_echo(sensor, hall(RETRO))
+    echo = replace(echo, range_m=np.full_like(echo.range_m, range_m))
+    found = _measure(
+        echo, QUIET.model_copy(update={"min_range_m": 0.0, "range_step_mm": step_mm}), (1, "before", ""), 0
+    )
+    assert (found.geom[echo.geom >= 0] >= 0).all() == is_return

@@ -79,6 +79,16 @@ def test_the_mirrored_share_is_fresnels() -> None:
     assert (np.diff(shares[25:]) > 0).all()
 
 
+def spread_by_refraction(cosine: float) -> float:
+    """Return by how much the solid angle of a narrow bundle grows where it leaves the water, from Snell's law."""
+    above = np.arccos(cosine) + np.array([-1e-4, 1e-4])
+    below = np.arcsin(np.sin(above) / WATER_INDEX)
+    # solid angles are differences of cosines; flat beams shorten the section of the bundle
+    solid = np.abs(np.diff(np.cos(above)) / np.diff(np.cos(below)))[0]
+    shortened = cosine / np.cos(np.arcsin(np.sqrt(1 - cosine**2) / WATER_INDEX))
+    return float(solid * shortened)
+
+
 def test_the_floor_under_water_is_weak_and_seems_deeper(sensor: SensorMetadata) -> None:
     rays, dry, wet = echoes(sensor, *lake())
     steep = np.argwhere((wet.geom == 0) & (rays.directions[..., 2] < -0.3))
@@ -87,6 +97,7 @@ def test_the_floor_under_water_is_weak_and_seems_deeper(sensor: SensorMetadata) 
         cosine = -float(rays.directions[column, row, 2])
         path_m = DEPTH_M / np.sqrt(1 - (1 - cosine**2) / WATER_INDEX**2)
         passed = (1 - mirrored_share(np.array(cosine), WATER_INDEX)) ** 2 * np.exp(-2 * WATER_ABSORPTION_PER_M * path_m)
+        passed /= spread_by_refraction(cosine)
         assert wet.photons[column, row] == pytest.approx(dry.photons[column, row] * passed, rel=1e-3)
         seems_m = dry.range_m[column, row] - DEPTH_M / cosine + WATER_INDEX * path_m
         assert wet.range_m[column, row] == pytest.approx(seems_m, abs=1e-4)

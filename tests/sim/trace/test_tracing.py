@@ -15,10 +15,11 @@ from skimage.measure import marching_cubes
 
 from cdpipe.core.errors import ScenarioError
 from scenarios import check_scenario
-from scenarios.schema import MeshFile
+from scenarios.schema import Drift, MeshFile, Section, Tunnel
 from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 from sim.rock.centreline import build_centreline
+from sim.rock.tunnel import mesh_tunnel
 from sim.trace import draft_scenario, format_scenario, save_picture, trace_mesh
 from sim.trace.inside import find_inside
 from sim.trace.route import find_route
@@ -209,3 +210,34 @@ def test_the_picture_is_a_png_whatever_the_mesh_is_called(
     found = trace_mesh(MeshFile(path=saved(tube(), "a$b$\\frac{.stl")))
     save_picture(found, tmp_path / "trace.png")
     assert (tmp_path / "trace.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.parametrize(("width_m", "height_m"), [(4.0, 4.0), (5.5, 5.0)])
+def test_a_smooth_drift_is_traced_from_end_to_end(width_m: float, height_m: float, saved: Save) -> None:
+    nodes = {"a": (0, 0, 0), "b": (25, 0, 0), "c": (48, 12, 0)}
+    for names in (("a", "b"), ("a", "b", "c")):
+        section = Section(width_m=width_m, height_m=height_m, shape="d")
+        used = {name: nodes[name] for name in names}
+        tunnel = Tunnel(nodes=used, drifts=(Drift(nodes=names),), section=section, roughness=(), resolution_m=0.4)
+        centreline = build_centreline(tunnel, 1)
+        walls = mesh_tunnel(tunnel, centreline, 1)
+        found = trace_mesh(MeshFile(path=saved(trimesh.Trimesh(walls.vertices, walls.faces, process=False), "d.ply")))
+        length_m = float(np.linalg.norm(np.diff(centreline.drifts[0].points, axis=0), axis=1).sum())
+        assert found.length_m > length_m - 1.5 * width_m, names
+
+
+def test_faces_that_are_turned_are_named_before_anything_is_traced(
+    tube: Callable[..., trimesh.Trimesh], saved: Save
+) -> None:
+    solid = tube()
+    solid.faces[::3] = solid.faces[::3, ::-1]
+    assert "the two faces do not face the same way" in refusal(saved(solid, "mixed.ply"))
+
+
+def test_a_steep_ramp_is_refused_with_the_way_to_trace_it(saved: Save) -> None:
+    nodes = {"a": (0, 0, 0), "b": (30, 0, 20)}
+    solid = trimesh.creation.box(extents=(36.0, 4.0, 4.0)).subdivide_to_size(1.0)
+    solid.apply_transform(trimesh.transformations.rotation_matrix(-np.arctan2(20, 30), (0, 1, 0)))
+    solid.apply_translation(np.mean(list(nodes.values()), axis=0))
+    solid.invert()
+    assert "--up z for a shaft or a ramp" in refusal(saved(solid, "ramp.stl"))
