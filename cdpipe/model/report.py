@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+# No displacement of the rock may be larger: the search for the after surface ends there.
+MAX_DISPLACEMENT_M = 5.0
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Clusters:
     """Groups of new map points that a source of regions cut out itself; C of them, N points in all.

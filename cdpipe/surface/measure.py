@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -23,7 +24,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array
 from cdpipe.core.plugins import require_extra
 from cdpipe.core.threads import allowed_threads
 from cdpipe.model.config import PipelineConfig, SurfaceConfig
-from cdpipe.model.report import ChangedObject, SurfaceField
+from cdpipe.model.report import MAX_DISPLACEMENT_M, ChangedObject, SurfaceField
 from cdpipe.model.types import MergedMaps
 from cdpipe.surface.cells import NearReturns, SurfaceCells, make_cells, near_returns
 from cdpipe.surface.hollows import is_hollow, measure_hollows
@@ -79,6 +80,7 @@ def measure_surface(
     chainage_m, angle_deg, _ = unroll(places.points, path)
     after = near_returns(merged, "after")
     measured = load_method(settings.method)(cells, after, places, chainage_m, config)
+    measured = _within_search(measured)
     is_rock, is_of_object = split_rock(objects, places, measured.along_m, measured.level_m)
     along_m, displacement_m = (
         np.where(is_of_object, np.nan, values) for values in (measured.along_m, measured.displacement_m)
@@ -93,6 +95,18 @@ def measure_surface(
         places.points, places.normals, displacement_m, measured.level_m, region, regions, chainage_m, angle_deg
     )
     return field, is_rock, time.perf_counter() - start
+
+
+def _within_search(measured: Measured) -> Measured:
+    """Return what was measured, NaN beyond the largest displacement that an answer may state, and where infinite."""
+    is_known = (np.abs(measured.displacement_m) <= MAX_DISPLACEMENT_M) & (
+        np.abs(measured.along_m) <= MAX_DISPLACEMENT_M
+    )
+    displacement_m, along_m = (
+        np.where(is_known, values, np.nan) for values in (measured.displacement_m, measured.along_m)
+    )
+    level_m = np.where(np.isfinite(measured.level_m), measured.level_m, np.nan)
+    return replace(measured, displacement_m=displacement_m, along_m=along_m, level_m=level_m)
 
 
 def measure_planes(

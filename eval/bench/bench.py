@@ -153,6 +153,8 @@ def require_writable(path: Path) -> None:
     """
     if path.is_dir():
         raise InputError(f"{path}: is a folder: name a file for the table")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: a device or a pipe: name a file for the table")
     make_writable(path.absolute().parent)
 
 

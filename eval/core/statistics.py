@@ -1,4 +1,4 @@
-"""Means and medians over session pairs, with 95 % intervals whose unit is the session pair."""
+"""Means and medians over session pairs, with 95 % intervals that draw session pairs, or whole groups of them."""
 
 from __future__ import annotations
 
@@ -99,6 +99,40 @@ def bootstrap_interval(values: Float64Array, statistic: Statistic = "mean", seed
     return interval_of(results)
 
 
+def clustered_interval(values: Float64Array, group: Int64Array, statistic: Statistic = "mean") -> tuple[float, float]:
+    """Return the 95 % bootstrap interval of the mean or median of (N,) numbers; whole groups of them are drawn.
+
+    Args:
+        values: One for each item, without NaN.
+        group: (N,) which pair or tunnel each is of; groups without an item are not drawn.
+        statistic: Over all items of the groups that were drawn, as often as they were.
+
+    Returns:
+        NaN for fewer than two groups: one says nothing about how they vary.
+    """
+    _, place = np.unique(group, return_inverse=True)
+    n_groups = int(place.max(initial=-1)) + 1
+    if n_groups < 2:
+        return float("nan"), float("nan")
+    draws = stream(0, "bootstrap").integers(n_groups, size=(N_RESAMPLES, n_groups))
+    if statistic == "mean":
+        sums, counts = np.bincount(place, values), np.bincount(place)
+        samples = sums[draws].sum(axis=1) / counts[draws].sum(axis=1)
+    else:
+        order = np.argsort(values, kind="stable")
+        times_drawn = np.stack([np.bincount(draw, minlength=n_groups) for draw in draws])
+        samples = _repeated_medians(values[order], times_drawn[:, place[order]])
+    return interval_of(samples)
+
+
+def _repeated_medians(rising: Float64Array, times: Int64Array) -> Float64Array:
+    """Return (B,) medians of (N,) rising numbers, each taken (B, N) times; every row takes at least one."""
+    up_to = np.cumsum(times, axis=1)
+    n = up_to[:, -1:]
+    lower, upper = ((up_to <= rank).sum(axis=1) for rank in ((n - 1) // 2, n // 2))
+    return np.asarray((rising[lower] + rising[upper]) / 2)
+
+
 @lru_cache(maxsize=2)
 def _draws(seed: int, n: int) -> Int64Array:
     """Return the (N_RESAMPLES, n) pairs that each bootstrap sample draws; a table asks for the same ones many times."""
@@ -130,29 +164,37 @@ def mean_with_interval(values: Float64Array, seed: int = 0) -> tuple[float, floa
     return mean(values), low, high, len(values)
 
 
-def paired_difference(a: Float64Array, b: Float64Array, seed: int = 0) -> dict[str, Any]:
+def paired_difference(
+    a: Float64Array, b: Float64Array, seed: int = 0, tunnels: Int64Array | None = None
+) -> dict[str, Any]:
     """Return the mean difference b - a over the pairs that have a number on both sides.
 
     Args:
         a: (N,) numbers of one side, one for each session pair, NaN where undefined.
         b: (N,) numbers of the other side, for the same pairs.
         seed: Seed of the bootstrap.
+        tunnels: (N,) numbers of the tunnels; pairs of one tunnel are drawn together. None: each has its own.
 
     Returns:
-        `n_used` pairs with both numbers, `n_only_a` and `n_only_b` with one; over those used the means `mean_a` and
-        `mean_b` and the `difference` with its 95 % interval `low` to `high`, NaN where there is none.
+        `n_used` pairs with both numbers, of `n_tunnels` tunnels, `n_only_a` and `n_only_b` with one; over those used
+        the means `mean_a` and `mean_b` and the `difference` with its 95 % interval `low` to `high`, NaN where there is
+        none.
     """
     has_a, has_b = ~np.isnan(a), ~np.isnan(b)
     used = has_a & has_b
     difference, low, high, n_used = mean_with_interval((b - a)[used], seed)
+    n_tunnels = n_used if tunnels is None else len(np.unique(tunnels[used]))
+    if tunnels is not None and n_tunnels < n_used:
+        low, high = clustered_interval((b - a)[used], tunnels[used])
     return {
-        "n_used": n_used, "n_only_a": int((has_a & ~has_b).sum()), "n_only_b": int((has_b & ~has_a).sum()),
+        "n_used": n_used, "n_tunnels": n_tunnels,
+        "n_only_a": int((has_a & ~has_b).sum()), "n_only_b": int((has_b & ~has_a).sum()),
         "mean_a": mean(a[used]), "mean_b": mean(b[used]), "difference": difference,
         "low": low, "high": high,
     }  # fmt: skip
 
 
-def wilson_interval(n_hits: int, n: int) -> tuple[float, float]:
+def wilson_interval(n_hits: float, n: float) -> tuple[float, float]:
     """Return the 95 % Wilson score interval of the share of `n` pairs that are hits; NaN for none.
 
     Unlike the bootstrap, it has a width where all pairs agree: 20 of 20 gives 0.84 to 1.

@@ -16,7 +16,7 @@ def parse_seeds(value: Any) -> tuple[int, ...]:
     Raises:
         ValueError: It has another form, is empty, or names a seed twice.
     """
-    rule = 'expected "A:B" in quotes (B excluded) or a list of seeds, all 0 or larger'
+    rule = 'expected "A:B" in quotes (B excluded) or a list of seeds, all 0 or larger, of 15 digits at most'
     if isinstance(value, str):
         match = re.fullmatch(r"(\d{1,15})(?::(\d{1,15}))?", value.strip())
         if match is None:

@@ -17,13 +17,13 @@ import pandas as pd
 from cdpipe.core.geometry import BoolArray, Float64Array
 from eval.core.charts import BLACK, BLUE, Axis, Drawing, Look, Panel, Series, log_span
 from eval.core.domains import domain_name
-from eval.core.statistics import mean, mean_with_interval, median
+from eval.core.statistics import mean, median
 from eval.report.drawing.charts import Chart
 from eval.report.drawing.looks import look_of
 from eval.report.pooled import pooled_recalls
 from eval.running.results.cases import comparable
 from eval.running.results.run_data import RunData
-from eval.tables.rows import ALL_DOMAINS, DOMAINS, is_told_the_truth, numbers, records
+from eval.tables.rows import ALL_DOMAINS, DOMAINS, is_told_the_truth, means_with_intervals, numbers, records
 
 _RECALL_AT_RATE, _RECALL_AT_K, _F1 = "recall_at_0.1", "region_recall_at_k", "object_f1_50"
 _TIME, _BYTES = "t_total_s", "bytes_regions_before"
@@ -87,7 +87,9 @@ def pareto_table(data: RunData) -> pd.DataFrame:
 def _quality(own: pd.DataFrame, quality: str, pooled: pd.DataFrame) -> dict[str, float]:
     """Return value, interval and number of pairs; recall at a rate is looked up, everything else is a mean."""
     if quality != _RECALL_AT_RATE:
-        values = mean_with_interval(numbers(own, quality))
+        found = means_with_intervals(own, (quality,))
+        n = int(np.count_nonzero(~np.isnan(numbers(own, quality))))
+        values = (*(found[f"{quality}{end}"] for end in ("", "_low", "_high")), n)
     else:
         row = pooled.merge(own[["domain", "variant"]].drop_duplicates(), on=["domain", "variant"])
         value, low, high = (mean(numbers(row, f"{quality}{end}")) for end in ("", "_low", "_high"))

@@ -116,7 +116,8 @@ def _slopes(steps: pd.DataFrame) -> Chart:
     n_pairs = int(steps["n_judged"].max())
     caption = (
         f"Recall at 0.1 false regions per 100 m over up to n = {n_pairs} pairs a step, easiest step on the left; a "
-        "pair without an answer finds nothing. The grey line is one half. hard.csv has the 95 % intervals."
+        "pair without an answer is lost, and of a few short ones loses the step. The grey line is one half. hard.csv "
+        "has the 95 % intervals."
     )
     return Chart("hard", "What breaks whom, and where", Drawing(rows, 210), caption, has_png=True)
 

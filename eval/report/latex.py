@@ -17,20 +17,18 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.core.names import visible
-from eval.core.statistics import paired_difference
 from eval.report.comparing.columns import COMPARED
-from eval.report.comparing.differences import BETTER, WORSE, pooled_difference, verdict
+from eval.report.comparing.differences import is_told_apart
 from eval.report.objects.tables import OBJECT_COLUMNS
-from eval.report.pooled import POOLED
 from eval.report.regions.regions import REGION_COLUMNS
 from eval.report.summary import means_by_method
 from eval.report.tables import Table, methods_table
 from eval.running.results.cases import comparable, is_unmade
 from eval.running.results.grids import off_grids
 from eval.running.results.run_data import RunData, plan_name, stored_table
-from eval.running.results.sides import Side, is_contended
+from eval.running.results.sides import is_contended
 from eval.tables.columns import EN_DASH, RESULT_COLUMNS, THIN_SPACE, Column, select
-from eval.tables.rows import ALL_DOMAINS, PAIR, is_told_the_truth, numbers, records, texts, with_domain
+from eval.tables.rows import ALL_DOMAINS, PAIR, is_told_the_truth, records, texts, with_domain
 
 _MARKS = {"bold": r"\textbf{%s}", "small": r"{\scriptsize %s}", "dagger": r"%s$^\dagger$", "": "%s"}
 _HEADING_WIDTH = 13
@@ -137,27 +135,11 @@ def _marks(
     )[1]
     for place, row in enumerate(rows):
         if not marks[place] and not is_told_the_truth(str(row["variant"])) and not math.isnan(float(row[column.key])):
-            apart = _is_told_apart(of_method, column, str(rows[top]["variant"]), str(row["variant"]), data)
+            apart = is_told_apart(of_method, column, str(rows[top]["variant"]), str(row["variant"]), data)
             marks[place] = "dagger" if apart is False else ""
             if apart is None:
                 untested.add(column.key)
     return marks
-
-
-def _is_told_apart(
-    of_method: Mapping[str, pd.DataFrame], column: Column, first: str, second: str, data: RunData
-) -> bool | None:
-    """Tell whether two methods differ beyond noise in a column; None where it has no number for each pair."""
-    own = [of_method[first], of_method[second]]
-    pairs = own[0].index.intersection(own[1].index)
-    if column.key == POOLED:
-        rows = pooled_difference((Side(data), Side(data)), (first, second), pairs)
-    elif column.key in own[0]:
-        a, b = (numbers(frame[[column.key]].loc[pairs], column.key) for frame in own)
-        rows = [paired_difference(a, b)]
-    else:
-        rows = []
-    return verdict({"good": "high", **rows[0]}) in (BETTER, WORSE) if rows else None
 
 
 def _caption(words: str, data: RunData, results: pd.DataFrame) -> str:

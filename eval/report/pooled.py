@@ -59,7 +59,7 @@ def _recall(data: RunData, own: pd.DataFrame) -> dict[str, float]:
     ranked = rank_pairs(data, str(own["variant"].iloc[0]), pairs)
     if ranked is None:
         return dict.fromkeys(COLUMNS[3:], math.nan)
-    is_enough = np.count_nonzero(ranked.n_observable) > 1
+    is_enough = ranked.has_interval
     drawn = resampled_recalls(ranked, POOLED_RATE_PER_100M) if is_enough else np.zeros(0)
     low, high = interval_of(drawn) if is_enough else (math.nan, math.nan)
     return {POOLED: recall_at(ranked, POOLED_RATE_PER_100M), f"{POOLED}_low": low, f"{POOLED}_high": high}

@@ -11,7 +11,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import FARTHEST_M, BoolArray, Float64Array, Int64Array, require_poses, require_shape
 from cdpipe.core.yamlfile import suggest
 from cdpipe.io.answer import Answer
-from cdpipe.model.report import ChangedObject, ChangeRegions, SurfaceField
+from cdpipe.model.report import MAX_DISPLACEMENT_M, ChangedObject, ChangeRegions, SurfaceField
 from cdpipe.model.types import SessionName
 from eval.scoring.answer_rows import POINT_RADIUS_M, find_rows_near_points
 from eval.truth.ground_truth import SESSIONS, GroundTruth, SessionTruth
@@ -19,7 +19,6 @@ from eval.truth.scoring_points import ScoringPoints
 
 SECONDS = tuple(f"t_{name}_s" for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns", "surface"))
 MAX_SECONDS = 1e8  # three years
-MAX_DISPLACEMENT_M = 5.0  # the truth knows none that is larger
 MAX_AMOUNT = 1e15  # of bytes, points, scores and every other figure; a page shows no larger one
 _UNIT_TOLERANCE = 1e-3  # of the length of a normal: arrays may come as float32
 _MANY = 100  # so many valid returns include the first return of some cell

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
-from eval.core.statistics import N_RESAMPLES, Statistic, interval_of, mean, median
+from cdpipe.core.geometry import BoolArray, Int64Array
+from eval.core.statistics import clustered_interval, mean, median
 from eval.tables.conditions import told_apart
 from eval.tables.regions.curves import RankedPairs, found_at
-from eval.tables.rows import PAIR, numbers, texts
+from eval.tables.rows import PAIR, numbers, texts, tunnels_of
 
 RATE_PER_100M = 0.1
 EDGES: Mapping[str, tuple[float, ...]] = {
@@ -44,17 +44,17 @@ def objects_by_group(changes: pd.DataFrame) -> list[dict[str, Any]]:
 
     Returns:
         `measure` (prop_kind or hull_volume_m3), `value` (the kind), `low` and `high` of the bin (low included),
-        `n_changes`, `n_pairs`; `iou_point`, missed ones 0, with its 95 % bootstrap interval over session pairs;
+        `n_changes`, `n_pairs`; `iou_point`, missed ones 0, with its 95 % bootstrap interval over tunnels;
         `iou_matched_median`; `share_50`, with an IoU of at least 0.5; `share_found`, with a region that finds them;
         `kind_accuracy`, `displacement_error_m` and `volume_error` (medians; absolute share) over those matched.
     """
     own = main_changes(changes)
-    pair = pair_numbers(own)
+    pair, tunnels = pair_numbers(own), tunnels_of(own)
     rows = []
     for names, inside in _groups(own):
         part, of_pair = own[inside], pair[inside]
         iou = numbers(part, "iou_point")
-        low, high = clustered_interval(iou, of_pair)
+        low, high = clustered_interval(iou, tunnels[inside])
         rows.append(
             {
                 **names,
@@ -84,7 +84,8 @@ def recall_by_size(ranked: RankedPairs, changes: pd.DataFrame) -> list[dict[str,
     Returns:
         `measure`, `low` and `high` of the bin (low included), `n_changes`, `n_pairs`, and three recalls: `recall_at_k`
         over the K best candidates of each pair, `recall_reported` at the method's own threshold, `recall_at_rate` at
-        0.1 false regions per 100 m with its 95 % interval over session pairs, `interval_low` to `interval_high`.
+        0.1 false regions per 100 m with its 95 % interval over tunnels, the threshold held fixed, `interval_low` to
+        `interval_high`.
     """
     own = changes.iloc[ranked.change_rows]
     found = {
@@ -96,7 +97,8 @@ def recall_by_size(ranked: RankedPairs, changes: pd.DataFrame) -> list[dict[str,
     for measure in EDGES:
         for low, high, inside in _bins(own, measure):
             of_pair = ranked.change_pair[inside]
-            interval = clustered_interval(found["recall_at_rate"][inside].astype(np.float64), of_pair)
+            hits = found["recall_at_rate"][inside].astype(np.float64)
+            interval = clustered_interval(hits, ranked.tunnels[of_pair])
             rows.append(
                 {
                     "measure": measure,
@@ -126,40 +128,6 @@ def group_overview(groups: pd.DataFrame, variant: str) -> pd.DataFrame:
         for row in own[["measure", "value", "low", "high"]].itertuples(index=False)
     ]
     return pd.DataFrame(own.assign(object=objects)[list(names)].rename(columns=names))
-
-
-def clustered_interval(values: Float64Array, pair: Int64Array, statistic: Statistic = "mean") -> tuple[float, float]:
-    """Return the 95 % bootstrap interval of the mean or median of (N,) numbers; whole session pairs are drawn.
-
-    Args:
-        values: One for each item, without NaN.
-        pair: (N,) which pair each is of; pairs without an item are not drawn.
-        statistic: Over all items of the pairs that were drawn, as often as they were.
-
-    Returns:
-        NaN for fewer than two pairs: one says nothing about how pairs vary.
-    """
-    _, place = np.unique(pair, return_inverse=True)
-    n_pairs = int(place.max(initial=-1)) + 1
-    if n_pairs < 2:
-        return float("nan"), float("nan")
-    draws = stream(0, "bootstrap").integers(n_pairs, size=(N_RESAMPLES, n_pairs))
-    if statistic == "mean":
-        sums, counts = np.bincount(place, values), np.bincount(place)
-        samples = sums[draws].sum(axis=1) / counts[draws].sum(axis=1)
-    else:
-        order = np.argsort(values, kind="stable")
-        times_drawn = np.stack([np.bincount(draw, minlength=n_pairs) for draw in draws])
-        samples = _repeated_medians(values[order], times_drawn[:, place[order]])
-    return interval_of(samples)
-
-
-def _repeated_medians(rising: Float64Array, times: Int64Array) -> Float64Array:
-    """Return (B,) medians of (N,) rising numbers, each taken (B, N) times; every row takes at least one."""
-    up_to = np.cumsum(times, axis=1)
-    n = up_to[:, -1:]
-    lower, upper = ((up_to <= rank).sum(axis=1) for rank in ((n - 1) // 2, n // 2))
-    return np.asarray((rising[lower] + rising[upper]) / 2)
 
 
 def _groups(changes: pd.DataFrame) -> Iterator[tuple[dict[str, Any], BoolArray]]:

@@ -16,7 +16,7 @@ from eval.core.statistics import interval_of, mean
 from eval.plans.axes import Step, world_of_step
 from eval.plans.plan import Plan, list_methods, with_step
 from eval.tables.regions.curves import ranked_pairs, recall_at, resampled_recalls
-from eval.tables.rows import numbers
+from eval.tables.rows import count_failed, numbers
 
 FILES = ("hard", "breaking_points")
 RATE_PER_100M = 0.1
@@ -105,12 +105,11 @@ def _measure(results: pd.DataFrame, regions: pd.DataFrame, changes: pd.DataFrame
     if len(results) == 0:
         return {**dict.fromkeys(_COUNTS, 0), **dict.fromkeys((_RECALL, *_MEANS), math.nan)}
     ranked = ranked_pairs(results, regions, changes)
-    is_enough = np.count_nonzero(ranked.n_observable) > 1
-    low, high = interval_of(resampled_recalls(ranked, RATE_PER_100M)) if is_enough else (math.nan, math.nan)
+    low, high = interval_of(resampled_recalls(ranked, RATE_PER_100M)) if ranked.has_interval else (math.nan, math.nan)
     return {
         "n_pairs": len(results),
         "n_judged": len(ranked.pairs),
-        "n_failed": int((results["status"] != "ok").sum()),
+        "n_failed": count_failed(results),
         "n_observable": int(ranked.n_observable.sum()),
         _RECALL: recall_at(ranked, RATE_PER_100M),
         f"{_RECALL}_low": low,

@@ -14,12 +14,22 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
-from eval.core.statistics import median
+from eval.core.statistics import clustered_interval, median
 from eval.plans.targets import Targets
 from eval.scoring.object_sizes import PILE_KIND
 from eval.tables.conditions import by_condition, told_apart
-from eval.tables.groups import clustered_interval, main_changes, objects_by_group, pair_numbers
-from eval.tables.rows import by_domain, by_variant, means_with_intervals, numbers, of_cases, texts, with_domain
+from eval.tables.groups import main_changes, objects_by_group
+from eval.tables.rows import (
+    by_domain,
+    by_variant,
+    count_failed,
+    means_with_intervals,
+    numbers,
+    of_cases,
+    texts,
+    tunnels_of,
+    with_domain,
+)
 from eval.tables.targets import judged_targets
 
 FILES = ("objects_table", "objects_by_group", "objects_targets")
@@ -100,7 +110,7 @@ def _counts(own: pd.DataFrame, changes: pd.DataFrame) -> dict[str, Any]:
     return {
         "n_pairs": len(own),
         "n_refused": int((own["status"] == "merge_refused").sum()),
-        "n_failed": int((own["status"] != "ok").sum()),
+        "n_failed": count_failed(own),
         "n_changes": len(main_changes(changes)),
         "n_partial": int(np.nansum(numbers(own, "n_partial"))),
         "n_matched": int((numbers(main_changes(changes), "matched_object") >= 0).sum()),
@@ -144,5 +154,5 @@ def _over_changes(changes: pd.DataFrame) -> dict[str, float]:
 
 def _medians(name: str, values: Float64Array, changes: pd.DataFrame) -> tuple[int, dict[str, float]]:
     is_told = ~np.isnan(values)
-    low, high = clustered_interval(values[is_told], pair_numbers(changes[is_told]), "median")
+    low, high = clustered_interval(values[is_told], tunnels_of(changes[is_told]), "median")
     return int(is_told.sum()), {name: median(values), f"{name}_low": low, f"{name}_high": high}

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from cdpipe.core.geometry import BoolArray, Float64Array
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from eval.core.domains import domain_of
-from eval.core.statistics import mean_with_interval
+from eval.core.statistics import clustered_interval, mean_with_interval
+from scenarios.catalogue import clean_family
 
 PAIR = ["scenario", "seed"]
 ALL_DOMAINS = "all"
@@ -36,11 +38,45 @@ def numbers(table: pd.DataFrame, column: str) -> Float64Array:
     return pd.to_numeric(table[column], errors="coerce").to_numpy(dtype=np.float64)
 
 
+def tunnel_numbers(worlds: Iterable[str], seeds: Iterable[int]) -> Int64Array:
+    """Return (N,) a number for the tunnel of each pair, in the order of their first pairs.
+
+    Pairs of one seed share tunnel and drives where their worlds differ by settings, or by one effect of a mine
+    (`scenarios.catalogue.clean_family`). They are no independent samples: intervals draw them together.
+    """
+    keys = [(_tunnel_of(str(world)), int(seed)) for world, seed in zip(worlds, seeds, strict=True)]
+    place: dict[tuple[str, int], int] = {}
+    return np.array([place.setdefault(key, len(place)) for key in keys], dtype=np.int64)
+
+
+@lru_cache(maxsize=1024)
+def _tunnel_of(world: str) -> str:
+    family = world.partition("[")[0]
+    while (base := clean_family(family)) is not None:
+        family = base
+    return family
+
+
+def tunnels_of(table: pd.DataFrame) -> Int64Array:
+    """Return (N,) the number of the tunnel of each row of a table with scenario and seed, as `tunnel_numbers` does."""
+    return tunnel_numbers(table["scenario"], table["seed"])
+
+
 def means_with_intervals(table: pd.DataFrame, columns: Iterable[str]) -> dict[str, float]:
-    """Return the mean of each column over session pairs, and its 95 % interval under `..._low` and `..._high`."""
+    """Return the mean of each column over session pairs, and its 95 % interval under `..._low` and `..._high`.
+
+    The interval draws tunnels with all of their pairs.
+    """
     found: dict[str, float] = {}
+    tunnels = tunnels_of(table)
+    is_shared = len(np.unique(tunnels)) < len(tunnels)
     for name in columns:
-        found[name], found[f"{name}_low"], found[f"{name}_high"], _ = mean_with_interval(numbers(table, name))
+        values = numbers(table, name)
+        found[name], low, high, _ = mean_with_interval(values)
+        if is_shared:
+            is_number = ~np.isnan(values)
+            low, high = clustered_interval(values[is_number], tunnels[is_number])
+        found[f"{name}_low"], found[f"{name}_high"] = low, high
     return found
 
 
@@ -60,6 +96,12 @@ def is_answered(cases: pd.DataFrame) -> BoolArray:
     """Mark the rows of results.csv, or of their figures, that are of an answer."""
     told = cases["status"] == "ok" if "status" in cases else cases["is_answered"] == 1
     return told.to_numpy(dtype=np.bool_)
+
+
+def count_failed(results: pd.DataFrame) -> int:
+    """Return how many rows of results.csv have a pair, but no answer: a world that was not made asks nothing."""
+    is_judged = results["n_observable"].notna() if "n_observable" in results else True
+    return int(((results["status"] != "ok") & is_judged).sum())
 
 
 def stated(cases: pd.DataFrame, column: str) -> Float64Array:

@@ -26,8 +26,14 @@ class SurfaceConfig(GrownSettings):
         ),
     )
     spacing_m: Cell = Field(0.25, description="voxel of the before surface that has one place of measurement")
-    normal_m: Positive = Field(0.3, description="radius within which the normal and roughness of a place are estimated")
-    radius_m: Positive = Field(0.2, description="`planes`: radius of the spheres that both surfaces are averaged over")
+    normal_m: Positive = Field(
+        0.3,
+        description="radius within which the normal and roughness of a place are estimated, from the nearest 80 cells",
+    )
+    radius_m: Positive = Field(
+        0.2,
+        description="`planes`: radius of the spheres that both surfaces are averaged over, from the nearest 120 cells",
+    )
     window_m: Positive = Field(
         8.0, description="`planes`: what most rock within this way along the path shares is the alignment's motion"
     )

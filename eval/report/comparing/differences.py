@@ -17,9 +17,11 @@ from cdpipe.core.errors import InputError
 from eval.core.statistics import ENOUGH_PAIRS, paired_difference
 from eval.report.comparing.columns import COMPARED, figures_of, is_time
 from eval.report.pooled import POOLED, POOLED_RATE_PER_100M, rank_pairs
+from eval.running.results.run_data import RunData
 from eval.running.results.sides import Side, check_extras, check_versions, matched_variants
+from eval.tables.columns import Column
 from eval.tables.regions.curves import recall_at, recall_difference
-from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, numbers
+from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, numbers, tunnels_of
 
 BETTER, WORSE, NOISE = "better", "worse", "no difference beyond noise"
 SAME, TOO_FEW, NOT_JUDGED = "the same", "too few pairs", "not judged"
@@ -77,7 +79,7 @@ def paired_differences(a: pd.DataFrame, b: pd.DataFrame, seed: int = 0) -> list[
     """Return the difference of each compared column over the pairs that have a number on both sides.
 
     Args:
-        a: (N, columns) figures of one side, a row for each session pair.
+        a: (N, columns) figures of one side, a row for each session pair, by scenario and seed.
         b: The same pairs in the same order.
         seed: Seed of the bootstrap.
 
@@ -85,9 +87,10 @@ def paired_differences(a: pd.DataFrame, b: pd.DataFrame, seed: int = 0) -> list[
         A row for each column that at least one pair has on both sides.
     """
     columns = [column for column in COMPARED if column.key in a and column.key in b]
+    tunnels = tunnels_of(a.index.to_frame())
     found = [
         {"metric": column.key, "good": column.better,
-         **paired_difference(numbers(a, column.key), numbers(b, column.key), seed)}
+         **paired_difference(numbers(a, column.key), numbers(b, column.key), seed, tunnels)}
         for column in columns
     ]  # fmt: skip
     return [row for row in found if row["n_used"]]
@@ -97,13 +100,14 @@ def verdict(row: Mapping[str, Any]) -> str:
     """Return the word for a difference b - a.
 
     Args:
-        row: `good`, the direction ("high" or "low") in which the figure should move; `n_used`, over how many session
-            pairs the difference is; `difference` and its 95 % interval `low` to `high`, NaN for none.
+        row: `good`, the direction ("high" or "low") in which the figure should move; `n_used` and `n_tunnels`, over
+            how many session pairs of how many tunnels the difference is; `difference` and its 95 % interval `low` to
+            `high`, NaN for none.
     """
     low, high = row["low"], row["high"]
     if row["difference"] == low == high == 0.0:
         return SAME
-    if row["n_used"] < ENOUGH_PAIRS or math.isnan(low):
+    if row.get("n_tunnels", row["n_used"]) < ENOUGH_PAIRS or math.isnan(low):
         return TOO_FEW
     if low <= 0.0 <= high:
         return NOISE
@@ -149,10 +153,36 @@ def pooled_difference(
     difference, low, high = recall_difference(first, second, POOLED_RATE_PER_100M, seed)
     return [
         {
-            "metric": POOLED, "good": "high", "n_used": n_used, "n_only_a": 0, "n_only_b": 0, "mean_a": recalls[0],
-            "mean_b": recalls[1], "difference": difference, "low": low, "high": high,
+            "metric": POOLED, "good": "high", "n_used": n_used,
+            "n_tunnels": len(np.unique(first.tunnels[first.n_observable > 0])), "n_only_a": 0, "n_only_b": 0,
+            "mean_a": recalls[0], "mean_b": recalls[1], "difference": difference, "low": low, "high": high,
         }
     ]  # fmt: skip
+
+
+def is_told_apart(
+    of_method: Mapping[str, pd.DataFrame], column: Column, first: str, second: str, data: RunData
+) -> bool | None:
+    """Tell whether two methods of a run differ beyond noise in a column; None where it has no number for each pair.
+
+    Args:
+        of_method: Figures of each method, a row for each session pair, by scenario and seed.
+        column: The column.
+        first: One method.
+        second: The other.
+        data: The run.
+    """
+    own = [of_method[first], of_method[second]]
+    pairs = own[0].index.intersection(own[1].index)
+    if column.key == POOLED:
+        rows = pooled_difference((Side(data), Side(data)), (first, second), pairs)
+    elif column.key in own[0]:
+        a, b = (numbers(frame[[column.key]].loc[pairs], column.key) for frame in own)
+        tunnels = tunnels_of(pairs.to_frame())
+        rows = [paired_difference(a, b, tunnels=tunnels)]
+    else:
+        rows = []
+    return verdict({"good": "high", **rows[0]}) in (BETTER, WORSE) if rows else None
 
 
 def _place(row: Mapping[str, Any]) -> tuple[bool, int, str]:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from eval.core.domains import domain_name
+from eval.report.comparing.differences import is_told_apart
 from eval.report.hardness import count_held, name_breaks
 from eval.report.summary import HEADLINES, rank_methods
 from eval.report.surface.surface import SURFACE_COLUMNS
@@ -19,7 +21,7 @@ from eval.running.results.grids import off_grids
 from eval.running.results.run_data import RunData, ends_at_merge, plan_name, shown_variant, stored_table
 from eval.tables.columns import Column, share
 from eval.tables.merge_table import ALL_FAMILIES
-from eval.tables.rows import ALL_DOMAINS, is_told_the_truth, numbers, records
+from eval.tables.rows import ALL_DOMAINS, PAIR, is_told_the_truth, numbers, records
 
 _MOST_NAMES = 3
 _NEXT_SETTING = re.compile(r",(?=[a-z0-9_.-]+=)")
@@ -54,7 +56,9 @@ def write_answer(data: RunData, merges: pd.DataFrame) -> str:
     return told or _TOO_LITTLE
 
 
-def name_leaders(values: Iterable[tuple[str, float]], column: Column) -> str:
+def name_leaders(
+    values: Iterable[tuple[str, float]], column: Column, is_apart: Callable[[str, str], bool | None] | None = None
+) -> str:
     """Return the methods with the best value as written, and those that come next; "" without two methods.
 
     Those that are told the truth take no part.
@@ -62,6 +66,8 @@ def name_leaders(values: Iterable[tuple[str, float]], column: Column) -> str:
     Args:
         values: Name and value of each method, NaN where it is undefined.
         column: Which direction wins, and how values are written.
+        is_apart: Tells whether two methods differ beyond noise. The sentence says so of the first of the best and the
+            first of the next, which are not "before" one another otherwise.
     """
     fair = [(name, value) for name, value in values if not is_told_the_truth(name) and math.isfinite(value)]
     if len(fair) < 2:
@@ -74,7 +80,8 @@ def name_leaders(values: Iterable[tuple[str, float]], column: Column) -> str:
     if not others:
         return f"all {len(leaders)} methods alike ({best})"
     second, followers = others[0]
-    return f"{_joined(leaders)} ({best}), before {_joined(followers)} ({second})"
+    link = "not told from" if is_apart is not None and is_apart(leaders[0], followers[0]) is False else "before"
+    return f"{_joined(leaders)} ({best}), {link} {_joined(followers)} ({second})"
 
 
 def _joined(names: Sequence[str]) -> str:
@@ -116,8 +123,11 @@ def name_without_shared(variants: Iterable[str]) -> tuple[str, dict[str, str]]:
     return ", ".join(each for each in next(iter(settings.values())) if each in shared), found
 
 
-def _told(table: pd.DataFrame, column: Column) -> str:
-    """Return who leads in every domain of a table, by one of its columns."""
+def _told(table: pd.DataFrame, column: Column, is_apart: Callable[[str, str, str], bool | None] | None = None) -> str:
+    """Return who leads in every domain of a table, by one of its columns.
+
+    `is_apart(domain, a, b)` tells whether two methods differ beyond noise there.
+    """
     names = table["variant"].astype(str)
     fair = names[~names.map(is_told_the_truth)]
     setting, values = name_by_setting(fair)
@@ -129,16 +139,32 @@ def _told(table: pd.DataFrame, column: Column) -> str:
     for domain, own in table.assign(variant=names.replace(values)).groupby("domain", sort=False):
         if domain == ALL_DOMAINS and table["domain"].nunique() > 1:
             continue
-        leaders = name_leaders(zip(own["variant"], numbers(own, column.key), strict=True), column)
+        named = {shown: name for name, shown in values.items()}
+        apart = partial(_is_apart_by_name, is_apart, str(domain), named) if is_apart is not None else None
+        leaders = name_leaders(zip(own["variant"], numbers(own, column.key), strict=True), column, apart)
         parts += [f"{domain_name(str(domain))}: {leaders}"] if leaders else []
     extreme = "Highest" if column.better == "high" else "Lowest"
     return f"{extreme} {column.heading}{by}, {'; '.join(parts)}." if parts else ""
 
 
 def _of_pairs(data: RunData) -> str:
-    ranked, shown, _ = rank_methods(data)
+    ranked, shown, figures = rank_methods(data)
     column = next((column for column in HEADLINES if column in shown and column.better == "high"), None)
-    return "" if column is None else _told(ranked, column)
+    if column is None:
+        return ""
+
+    def is_apart(domain: str, first: str, second: str) -> bool | None:
+        own = figures[figures["domain"] == domain]
+        of_method = {name: own[own["variant"] == name].set_index(PAIR) for name in (first, second)}
+        return is_told_apart(of_method, column, first, second, data)
+
+    return _told(ranked, column, is_apart)
+
+
+def _is_apart_by_name(
+    is_apart: Callable[[str, str, str], bool | None], domain: str, named: Mapping[str, str], first: str, second: str
+) -> bool | None:
+    return is_apart(domain, named.get(first, first), named.get(second, second))
 
 
 def _of_axes(data: RunData) -> str:

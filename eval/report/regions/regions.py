@@ -38,7 +38,7 @@ REGION_COLUMNS = (
     Column("recall_at_0.1", "recall at 0.1 false", "high", share,
            "Share of all observable changes found at the lowest threshold with at most 0.1 false regions per 100 m of "
            "after path, changed and unchanged pairs together; a threshold for each method and kind of site.",
-           "0 for the changes of a pair without an answer."),
+           "A pair without an answer misses its changes and counts as ten times the false regions allowed on it."),
     Column("recall_at_0.5", "at 0.5", "high", share, "The same at 0.5 false regions per 100 m."),
     Column("recall_at_0.1_proposed", "at 0.1, proposed", "high", share,
            "At 0.1 false regions per 100 m as if no region had been withdrawn: what the scores alone can do."),

@@ -24,7 +24,7 @@ import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
 from cdpipe.extract.extract import ASKED_POINTS
-from eval.tables.groups import clustered_interval
+from eval.core.statistics import clustered_interval
 from eval.tables.regions.curves import RankedPairs
 from eval.tables.rows import PAIR, numbers
 
@@ -135,7 +135,7 @@ def _mean_over_changes(values: Float64Array, ranked: RankedPairs) -> tuple[float
     """Return the mean over all changes and its interval; NaN where one has no value: else a pair would be left out."""
     if len(values) == 0 or np.isnan(values).any():
         return math.nan, math.nan, math.nan
-    return float(values.mean()), *clustered_interval(values.astype(np.float64), ranked.change_pair)
+    return float(values.mean()), *clustered_interval(values.astype(np.float64), ranked.tunnels[ranked.change_pair])
 
 
 def _named(name: str, values: tuple[float, float, float]) -> dict[str, float]:

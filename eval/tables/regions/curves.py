@@ -23,7 +23,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from cdpipe.core.ranking import comparable, last_of_ties
 from eval.core.statistics import N_RESAMPLES, interval_of
-from eval.tables.rows import PAIR
+from eval.tables.rows import PAIR, tunnel_numbers
 
 RATES_PER_100M = (0.1, 0.5)
 _BATCH = 100
@@ -59,6 +59,7 @@ class RankedPairs:
     """
 
     pairs: tuple[tuple[str, int], ...]
+    tunnels: Int64Array
     site: Int64Array
     path_m: Float64Array
     is_answered: BoolArray
@@ -73,6 +74,11 @@ class RankedPairs:
     change_score: Float64Array
     change_rank: Int64Array
     change_rows: Int64Array
+
+    @property
+    def has_interval(self) -> bool:
+        """Whether there are changes in more than one tunnel."""
+        return len(np.unique(self.tunnels[self.n_observable > 0])) > 1
 
 
 def ranked_pairs(
@@ -122,6 +128,7 @@ def ranked_pairs(
         ranks[pair] += 1
     return RankedPairs(
         pairs=tuple(pairs),
+        tunnels=tunnel_numbers(*zip(*pairs, strict=True)) if pairs else np.zeros(0, np.int64),
         site=np.unique(cases["score_radius_m"].to_numpy(dtype=np.float64), return_inverse=True)[1].astype(np.int64),
         path_m=cases["after_path_m"].to_numpy(dtype=np.float64),
         is_answered=(cases["status"] == "ok").to_numpy(dtype=np.bool_),
@@ -180,17 +187,18 @@ def recall_at(ranked: RankedPairs, rate_per_100m: float) -> float:
 
 @lru_cache(maxsize=64)  # a method is compared with all others, at each rate
 def resampled_recalls(ranked: RankedPairs, rate_per_100m: float, seed: int = 0) -> Float64Array:
-    """Return `recall_at` of bootstrap draws of pairs within each kind of site, thresholds set anew in each draw.
+    """Return `recall_at` of bootstrap draws of tunnels within each kind of site, thresholds set anew in each draw.
 
     Two methods that ran the same pairs get the same draws, so that their difference can be taken draw by draw.
     """
-    n_pairs = len(ranked.pairs)
-    weights = np.zeros((N_RESAMPLES, n_pairs))
-    row_starts = n_pairs * np.arange(N_RESAMPLES)[:, None]
+    weights = np.zeros((N_RESAMPLES, len(ranked.pairs)))
     for site in np.unique(ranked.site):
         own = np.flatnonzero(ranked.site == site)
-        draws = own[stream(seed, "bootstrap", f"site {site}").integers(len(own), size=(N_RESAMPLES, len(own)))]
-        weights += np.bincount((row_starts + draws).ravel(), minlength=weights.size).reshape(weights.shape)
+        tunnel, names = pd.factorize(ranked.tunnels[own])
+        n = len(names)
+        draws = stream(seed, "bootstrap", f"site {site}").integers(n, size=(N_RESAMPLES, n))
+        times = np.bincount((n * np.arange(N_RESAMPLES)[:, None] + draws).ravel(), minlength=n * N_RESAMPLES)
+        weights[:, own] = times.reshape(N_RESAMPLES, n)[:, tunnel]
     batches = range(0, N_RESAMPLES, _BATCH)
     return np.concatenate([_recalls(ranked, rate_per_100m, weights[first : first + _BATCH]) for first in batches])
 
@@ -200,10 +208,10 @@ def recall_difference(
 ) -> tuple[float, float, float]:
     """Return `recall_at` of b less that of a, and the low and high end of its 95 % interval, draw by draw.
 
-    The interval is NaN for different pairs, and for fewer than two pairs with an observable change.
+    The interval is NaN for different pairs, and for fewer than two tunnels with an observable change.
     """
     difference = recall_at(b, rate_per_100m) - recall_at(a, rate_per_100m)
-    if a.pairs != b.pairs or np.count_nonzero(a.n_observable) < 2:
+    if a.pairs != b.pairs or not a.has_interval:
         return difference, float("nan"), float("nan")
     drawn = [resampled_recalls(each, rate_per_100m, seed) for each in (a, b)]
     return difference, *interval_of(drawn[1] - drawn[0])

@@ -30,7 +30,16 @@ from eval.tables.regions.curves import (
     resampled_recalls,
     roc_curve,
 )
-from eval.tables.rows import by_domain, by_variant, means_with_intervals, numbers, of_cases, with_domain
+from eval.tables.rows import (
+    by_domain,
+    by_variant,
+    count_failed,
+    means_with_intervals,
+    numbers,
+    of_cases,
+    tunnels_of,
+    with_domain,
+)
 from eval.tables.targets import is_unchanged_pair, judged_targets
 
 FILES = ("regions_table", "regions_targets", "regions_by_size", "budgets", "roc", "froc")
@@ -142,7 +151,7 @@ def _counts(own: pd.DataFrame) -> dict[str, Any]:
     return {
         "n_pairs": len(own),
         "n_refused": int((own["status"] == "merge_refused").sum()),
-        "n_failed": int((own["status"] != "ok").sum()),
+        "n_failed": count_failed(own),
         "n_auroc": int(np.count_nonzero(~np.isnan(numbers(own, "region_auroc")))),
         "n_auroc_assumed": int(np.nansum(numbers(own, "is_auroc_assumed"))),
         "n_changed": int(np.count_nonzero(numbers(own, "n_observable") > 0)),
@@ -154,7 +163,7 @@ def _counts(own: pd.DataFrame) -> dict[str, Any]:
         "n_unchanged": n_unchanged,
         "n_silent": n_silent,
         "silent_share": n_silent / n_unchanged if n_unchanged else math.nan,
-        **dict(zip(("silent_low", "silent_high"), wilson_interval(n_silent, n_unchanged), strict=True)),
+        **dict(zip(("silent_low", "silent_high"), _interval_of_silence(alarms, unchanged), strict=True)),
         "km_unchanged": unchanged_m / 1000.0,
         "false_regions_per_100m_unchanged": 100.0 * n_false_unchanged / unchanged_m if unchanged_m > 0 else math.nan,
         "bytes_map_before": _mean_of_all(map_bytes),
@@ -162,6 +171,12 @@ def _counts(own: pd.DataFrame) -> dict[str, Any]:
         "bytes_ratio": _mean_of_all(map_bytes / np.where(kept_bytes >= 1, kept_bytes, math.nan)),
         **{name: median(numbers(answered, name)) for name in _MEDIANS},
     }
+
+
+def _interval_of_silence(alarms: Float64Array, unchanged: pd.DataFrame) -> tuple[float, float]:
+    """Return the Wilson interval of the share of silent pairs, as of so many as there are tunnels."""
+    share = len(np.unique(tunnels_of(unchanged))) / max(len(unchanged), 1)
+    return wilson_interval(int((alarms == 0).sum()) * share, len(unchanged) * share)
 
 
 def _mean_of_all(values: Float64Array) -> float:
@@ -172,7 +187,7 @@ def _mean_of_all(values: Float64Array) -> float:
 def _operating(ranked: RankedPairs) -> dict[str, float]:
     """Return recall at each false-alarm rate with its interval."""
     found: dict[str, float] = {}
-    is_enough = np.count_nonzero(ranked.n_observable) > 1
+    is_enough = ranked.has_interval
     for rate in RATES_PER_100M:
         low, high = interval_of(resampled_recalls(ranked, rate)) if is_enough else (math.nan, math.nan)
         name = f"recall_at_{rate:g}"

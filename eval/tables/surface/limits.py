@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
-from eval.tables.groups import clustered_interval, pair_numbers
-from eval.tables.rows import numbers
+from eval.core.statistics import clustered_interval
+from eval.tables.rows import numbers, tunnels_of
 
 FALSE_SHARE = 0.05
 # a factor of sqrt 2 to either side of 5, 10, 20, 40, 80 and 160 mm; the last bin also holds all that is larger
@@ -38,14 +38,14 @@ def detection_limits(windows: pd.DataFrame) -> list[dict[str, Any]]:
     Returns:
         `area_m2`; `from_m` to `to_m`, the bin of |true_m|, and `magnitude_m`, the median in it; `threshold_m`, NaN
         where the variant covers no null window, and `n_null_windows` that it covers; `false_share` of all null windows
-        beyond the threshold; `n_windows`; `found_share` of them with its 95 % bootstrap interval over session pairs;
-        `limit_m`, the same in all rows of an area: the smallest magnitude from which on at least half are found,
-        between two bins by the logarithm of the magnitude; NaN where half of the largest are not found.
+        beyond the threshold; `n_windows`; `found_share` of them with its 95 % bootstrap interval over tunnels, the
+        threshold held fixed; `limit_m`, the same in all rows of an area: the smallest magnitude from which on at least
+        half are found, between two bins by the logarithm of the magnitude; NaN where half of the largest are not found.
     """
     rows: list[dict[str, Any]] = []
     area_m2, is_null = numbers(windows, "area_m2"), windows["is_null"].astype(bool).to_numpy()
     true_m, answered_m = numbers(windows, "true_m"), numbers(windows, "answered_m")
-    pair, sets_threshold = pair_numbers(windows), numbers(windows, "cover") >= _COVERED
+    tunnels, sets_threshold = tunnels_of(windows), numbers(windows, "cover") >= _COVERED
     if "is_check" in windows:
         sets_threshold &= ~windows["is_check"].eq(True).to_numpy(dtype=np.bool_)
     for area in np.unique(area_m2):
@@ -59,7 +59,7 @@ def detection_limits(windows: pd.DataFrame) -> list[dict[str, Any]]:
             if not inside.any():
                 continue
             found = is_found[inside].astype(np.float64)
-            found_low, found_high = clustered_interval(found, pair[inside])
+            found_low, found_high = clustered_interval(found, tunnels[inside])
             own.append(
                 {
                     "area_m2": float(area),

@@ -9,11 +9,11 @@ import pytest
 import yaml
 
 from cdpipe.core.geometry import stream
-from eval.core.statistics import N_RESAMPLES, mean_with_interval
+from eval.core.statistics import N_RESAMPLES, clustered_interval, mean_with_interval
 from eval.plans.cells import expand_cells
 from eval.plans.plan import load_plan
 from eval.plans.targets import Target, Targets
-from eval.tables.groups import clustered_interval, group_overview, main_changes, objects_by_group
+from eval.tables.groups import group_overview, main_changes, objects_by_group
 from eval.tables.object_table import FILES, ORACLE_VARIANT, object_overview, object_tables
 
 NAN = float("nan")

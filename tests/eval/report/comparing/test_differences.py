@@ -28,6 +28,7 @@ from eval.running.results.sides import cautions, is_one_machine, only_in, read_s
 from eval.scoring.scoring import METRICS_VERSION
 from eval.tables.columns import select
 from eval.tables.regions.curves import ranked_pairs, recall_at
+from eval.tables.rows import PAIR
 
 NAN = float("nan")
 Write = Callable[..., Path]
@@ -134,7 +135,8 @@ def test_noise_is_called_moved_about_once_in_twenty_times() -> None:
 
 
 def _recall_verdict(a: pd.DataFrame, b: pd.DataFrame) -> str:
-    found = {each["metric"]: each for each in paired_differences(a, b)}["region_recall"]
+    first, second = (side.set_index(PAIR) for side in (a, b))
+    found = {each["metric"]: each for each in paired_differences(first, second)}["region_recall"]
     return verdict(found)
 
 

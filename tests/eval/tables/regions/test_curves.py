@@ -8,8 +8,8 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.ranking import auroc
-from eval.core.statistics import interval_of
-from eval.tables.groups import clustered_interval, recall_by_size
+from eval.core.statistics import clustered_interval, interval_of
+from eval.tables.groups import recall_by_size
 from eval.tables.regions import curves
 from eval.tables.regions.curves import (
     RankedPairs,

@@ -138,8 +138,18 @@ def test_bounds_on_displacement_are_judged_once_the_run_is_whole() -> None:
     results = pd.DataFrame([case(1, surface_error_median_m=0.004), case(2, surface_error_median_m=0.008)])
     bound = {"column": "surface_error_median_m", "name": "error"}
     targets = Targets(method="ours", surface=({**bound, "at_most": 0.005}, {**bound, "at_most": 0.006}))
-    judged = surface_tables(results, pd.DataFrame(null_windows()), targets)["surface_targets"]
+    windows = pd.DataFrame([*null_windows(), *(window(0.04, 0.03, seed=seed) for seed in (1, 2))])
+    judged = surface_tables(results, windows, targets)["surface_targets"]
     assert list(judged["value"]) == pytest.approx([0.006, 0.006])
     assert list(judged["is_met"]) == [False, True]
-    unfinished = surface_tables(results, pd.DataFrame(null_windows()), targets, is_whole=False)["surface_targets"]
+    unfinished = surface_tables(results, windows, targets, is_whole=False)["surface_targets"]
     assert list(unfinished["is_met"]) == [None, None]
+
+
+def test_a_field_of_zeros_meets_no_bound_on_errors() -> None:
+    results = pd.DataFrame([case(1, surface_error_median_m=0.0), case(2, surface_error_median_m=0.0)])
+    targets = Targets(method="ours", surface=({"column": "surface_error_median_m", "name": "e", "at_most": 0.005},))
+    for answered_m, is_met in ((0.0, False), (0.03, True)):
+        windows = pd.DataFrame([*null_windows(), *(window(0.04, answered_m, seed=seed) for seed in (1, 2))])
+        (row,) = surface_tables(results, windows, targets)["surface_targets"].to_dict("records")
+        assert row["is_met"] is is_met
