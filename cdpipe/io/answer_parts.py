@@ -163,6 +163,8 @@ def check_array_types(path: Path, arrays: Mapping[str, ArrayType], n_objects: in
             f"array object_points_odom is missing: the {n_objects} objects of answer.json need their points, (P, 3), "
             "or their object_returns, (M, 2)"
         )
+    if "object_returns" in arrays and "object_points_odom" in arrays:
+        mistakes.append("arrays object_returns and object_points_odom both say which points changed: leave one out")
     _raise_all(path, mistakes)
 
 

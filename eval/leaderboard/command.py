@@ -34,6 +34,7 @@ MERGE_WORD = "merge"
 STDERR_BYTES = 16_000
 _PLACEHOLDER = re.compile(r"\{(\w+)\}")
 _EXAMPLE = 'expected e.g. --command "python predict.py {before} {after} {out}"'
+_TAKES_CODE = ("-c", "-m", "-e")  # options after which no script stands
 _SCRIPT_SUFFIXES = (".py", ".sh", ".jl", ".R", ".pl")
 _BLOCK_BYTES = 1 << 14
 _PIPE_WAIT_S = 5.0
@@ -145,12 +146,13 @@ def _find_program(word: str) -> str:
 
 def _check_script(words: Sequence[str]) -> None:
     """Refuse a script that does not exist: the command would fail on every pair, after all are simulated."""
-    script = Path(words[0]) if words else Path()
-    if script.suffix not in _SCRIPT_SUFFIXES or "{" in words[0] or words[0].startswith("-") or script.exists():
+    word = next((word for word in words if not word.startswith("-") or word in _TAKES_CODE), "")
+    script = Path(word)
+    if script.suffix not in _SCRIPT_SUFFIXES or "{" in word or script.exists():
         return
     beside = (str(script.with_name(each.name)) for each in script.parent.glob(f"*{script.suffix}"))
     raise InputError(
-        f"--command: {visible(words[0])}: no such file in {visible(str(Path.cwd()))}{suggest(words[0], list(beside))}: "
+        f"--command: {visible(word)}: no such file in {visible(str(Path.cwd()))}{suggest(word, list(beside))}: "
         "name the script by its path from there, or by its whole path"
     )
 

@@ -14,6 +14,7 @@ import pandas as pd
 from eval.core.output import make_writable
 from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
 from eval.core.terminal.printing import count_pairs
+from eval.leaderboard.evaluation import list_merges
 from eval.leaderboard.reference import take_other_methods
 from eval.report.comparing.columns import COMPARED, figures_of, is_time
 from eval.report.comparing.differences import NOT_JUDGED, paired_differences, verdict
@@ -199,6 +200,10 @@ def _notes(
         yield f"the table is over the {len(shared)} of {len(own)} pairs that have reference rows"
     if any(is_told_the_truth(variant) for variant in others):
         yield "oracle-* methods were told the true merge, or the true regions as well"
+    merges = {name: merge for data in references for name, merge in list_merges(data.folder).items()}
+    for variant in others:
+        if merges.get(variant, "own") != "own":
+            yield f"{variant} was given {'the true merge' if merges[variant] == 'given' else 'the merge of tunnelcd'}"
     yield "times of different machines do not compare; a method that leaves one out has none"
 
 

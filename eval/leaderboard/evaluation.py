@@ -40,7 +40,7 @@ from eval.plans.worlds import world_slug
 from eval.running.cell_file import LAST, NO_KEY, cell_document
 from eval.running.export import copy_pair
 from eval.running.pair_run import TOOLS, Pair, Tools, pair_lock, score_unmade
-from eval.running.predictions import require_current_scores, require_free_name
+from eval.running.predictions import list_predicted, require_current_scores, require_free_name
 from eval.running.runfolder import RunFolder, write_json, write_tables
 from eval.running.runner import list_plan_pairs, open_pair, start_provenance
 from eval.running.stages.pair_stages import PairStages
@@ -100,11 +100,15 @@ class CallFile(Settings):
 
 @dataclass(frozen=True, slots=True)
 class EvaluationOutcome:
-    """How an evaluation ended: pairs answered now, kept from earlier, and those without an answer among all."""
+    """How an evaluation ended: pairs answered now, kept from earlier, and those without an answer.
+
+    Of these, `n_failed` are of all pairs and `n_failed_kept` of those that were kept.
+    """
 
     n_done: int
     n_kept: int
     n_failed: int
+    n_failed_kept: int = 0
 
 
 def evaluate_command(
@@ -148,11 +152,11 @@ def evaluate_command(
             progress.note(f"{pair.name} {pair.seed}: {error}")
     progress.cells("done", len(todo), len(todo))
     results = write_tables(run)
-    asked = {(pair.name, pair.seed) for pair in pairs}
     own = results[results["variant"] == method.name]
     failed = own[own["status"] != "ok"]
-    n_failed = sum(pair in asked for pair in zip(failed["scenario"], failed["seed"], strict=True))
-    return EvaluationOutcome(len(todo), len(pairs) - len(todo), n_failed)
+    failed_pairs = set(zip(failed["scenario"], failed["seed"], strict=True))
+    counts = [sum((pair.name, pair.seed) in failed_pairs for pair in some) for some in (pairs, todo)]
+    return EvaluationOutcome(len(todo), len(pairs) - len(todo), counts[0], counts[0] - counts[1])
 
 
 def evaluation_folder(run: RunFolder, name: str) -> Path:
@@ -168,6 +172,12 @@ def read_evaluation(run: RunFolder, name: str) -> EvaluationFile:
     """
     path = evaluation_folder(run, name) / "evaluation.json"
     return validate(EvaluationFile, Document(str(path), read_json(path, _EXPECTED)))
+
+
+def list_merges(run: RunFolder) -> dict[str, MergeMode]:
+    """Return what merge each method that was evaluated in a run was given."""
+    found = (path.parent.name for path in sorted(run.path.glob("evaluations/*/evaluation.json")))
+    return {each.name: each.merge for each in (read_evaluation(run, name) for name in found)}
 
 
 def read_call(run: RunFolder, name: str, scenario: str, seed: int) -> CallFile | None:
@@ -201,6 +211,11 @@ def _take_over(run: RunFolder, method: Method, plan: Plan, pairs: Sequence[Pair]
         split=plan.split, pairs=tuple((pair.name, pair.seed) for pair in pairs),
     )  # fmt: skip
     path = evaluation_folder(run, method.name) / "evaluation.json"
+    if not path.exists() and not force and (others := list_predicted(run, method.name)):
+        raise InputError(
+            f"--as {method.name}: {len(others)} answers of this name came from elsewhere: give another name, or "
+            "--force, which removes them"
+        )
     if path.exists() and not force:
         earlier = read_evaluation(run, method.name)
         for name, told in (("command", "--command"), ("merge", "--merge"), ("limit_s", "--time-limit")):
@@ -216,23 +231,33 @@ def _take_over(run: RunFolder, method: Method, plan: Plan, pairs: Sequence[Pair]
                 "--force, which answers all pairs again"
             )
     if force:
-        _remove_others(run, method.name, digest_method(document))
+        is_changed = _remove_others(run, method.name, digest_method(document))
+        if is_changed:  # no table holds the rows of another method while this one answers
+            write_tables(run) if any(True for _ in run.each_cell()) else remove(run.path / "results.csv")
     write_json(path, document.model_dump(mode="json"))
     return document
 
 
-def _remove_others(run: RunFolder, name: str, called: str) -> None:
-    """Remove the rows and answers under a name that are not of the method with this digest, also of other plans."""
-    calls = evaluation_folder(run, name)
+def _remove_others(run: RunFolder, name: str, called: str) -> bool:
+    """Remove the rows, answers and comparisons under a name that are not of the method with this digest.
+
+    Those of other plans go as well. Tells whether there were any.
+    """
+    calls, is_changed = evaluation_folder(run, name), False
     for kind, entry in (("cells", f"{path_part(name)}.json"), ("answers", path_part(name))):
         for pair in run.path.glob(f"{kind}/*/*"):
             call = _read_call_file(calls / pair.parent.name / f"{pair.name}.json")
-            if call is None or call.method_digest != called:
+            if (call is None or call.method_digest != called) and (pair / entry).exists():
                 remove(pair / entry)
+                is_changed = True
     for path in calls.glob("*/*.json"):
         call = _read_call_file(path)
         if call is None or call.method_digest != called:
             remove(path)
+    if is_changed:
+        for path in calls.glob("*.csv"):
+            remove(path)
+    return is_changed
 
 
 def _is_finished(run: RunFolder, method: Method, pair: Pair, called: str) -> bool:

@@ -24,6 +24,7 @@ from eval.leaderboard.comparison import (
     summarise_figures,
     take_figures,
 )
+from eval.leaderboard.evaluation import list_merges
 from eval.leaderboard.reference import find_reference
 from eval.leaderboard.submission import CheckedFile
 from eval.report.render import render_page, write_file
@@ -110,7 +111,8 @@ def _make_board(group: Sequence[CheckedFile], reference: Path | None) -> Board:
             for (name, found), each in zip(own.items(), group, strict=True)]  # fmt: skip
     # a run in which a method was evaluated holds its rows, too
     references = [(name, found) for name, found in _list_references(data, pairs) if name not in own]
-    rows += [(summarise_figures(name, found), "", True) for name, found in references]
+    merges = {} if data is None else {name: _MERGES[merge] for name, merge in list_merges(data.folder).items()}
+    rows += [(summarise_figures(name, found), merges.get(name, ""), True) for name, found in references]
     rows.sort(key=lambda row: _place(row[0]))
     title = f"Plan {first.plan}, {count_pairs(len(pairs))}{f', {first.split}' if first.split else ''}"
     return Board(title, tuple(_line(*row) for row in rows), tuple(_notes(group, data, len(pairs), rows)))

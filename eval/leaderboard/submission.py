@@ -33,6 +33,7 @@ from eval.core.provenance import git_commit, machine, versions
 from eval.leaderboard.evaluation import EvaluationFile, digest_method, digest_pair, read_call, read_evaluation
 from eval.leaderboard.given_merge import MergeMode
 from eval.running.cell_rows import TEXT_COLUMNS
+from eval.running.predictions import is_name_of_ours
 from eval.running.results.tables import LARGEST
 from eval.running.runfolder import RunFolder, json_text
 from eval.scoring.scoring import METRICS_VERSION, score_stored
@@ -209,9 +210,9 @@ def score_again(found: CheckedFile, run: RunFolder) -> int:
         with TemporaryDirectory(prefix="tunnelcd-") as answer:
             for name, content in files.items():
                 Path(answer, name).write_bytes(content)
-            row = score_stored(load_ground_truth(original), Path(answer)).row
-        for key, value in row.items():
-            if key not in _NAMES and not _is_same(pair.row.get(key), value):
+            score = score_stored(load_ground_truth(original), Path(answer))
+        for key, value in score.row.items():
+            if key not in _NAMES | score.plugins and not _is_same(pair.row.get(key), value):
                 raise InputError(
                     f"{found.path}: {case}: {key} = {pair.row.get(key)} in its row, and its answer scores {value}"
                 )
@@ -274,6 +275,10 @@ def _check_rows(document: Submission) -> None:
     if document.metrics_version != METRICS_VERSION:
         raise ValueError(
             f"scored by metrics version {document.metrics_version}, this tunnelcd scores by {METRICS_VERSION}"
+        )
+    if is_name_of_ours(document.name):
+        raise ValueError(
+            f"a preset or an oracle of tunnelcd is called {visible(document.name)}: another name is needed"
         )
     seen = set()
     for pair in document.pairs:

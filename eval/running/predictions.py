@@ -19,7 +19,7 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.names import folded, require_table_name, visible
+from cdpipe.core.names import folded, path_part, require_table_name, visible
 from cdpipe.core.yamlfile import suggest
 from cdpipe.model.config import preset_names
 from eval.core.output import copy_folder, remove
@@ -54,6 +54,7 @@ def add_predictions(run: RunFolder, folder: Path, name: str, progress: RunProgre
     progress = progress or Silent()
     found = _matched(run, folder, list_pairs(run))
     require_free_name(run, name)
+    _require_not_evaluated(run, name)
     require_current_scores(run)
     documents: dict[Path, dict[str, Any]] = {}
     mistakes: list[str] = []
@@ -101,6 +102,7 @@ def evaluate(predict: Callable[[Path, Path], object], run: Path | str, name: str
     """
     folder = open_run_folder(Path(run))
     require_free_name(folder, name)
+    _require_not_evaluated(folder, name)
     require_current_scores(folder)
     with TemporaryDirectory(prefix="tunnelcd-") as place:
         pair, answer, kept, answers = (Path(place) / part for part in ("pair", "answer", "kept", "answers"))
@@ -111,6 +113,11 @@ def evaluate(predict: Callable[[Path, Path], object], run: Path | str, name: str
             answer.mkdir()
             copy_pair(original, pair)
             predict(pair, answer)
+            if not (answer / _FILES[0]).is_file():
+                raise InputError(
+                    f"pair {number + 1} of {len(originals)}: the function wrote no {_FILES[0]} to its second argument: "
+                    'write one of status "failed" where there is no answer'
+                )
             # answers stand beside the pairs that are still to come: their names tell nothing before the last call
             copy_folder(answer, kept / str(number))
             remove(pair)
@@ -182,6 +189,22 @@ def _matched(run: RunFolder, folder: Path, pairs: Sequence[Path]) -> dict[Path, 
     return found
 
 
+def is_name_of_ours(name: str) -> bool:
+    """Tell whether a preset or an oracle of tunnelcd is called so."""
+    return folded(name.partition("[")[0]) in map(folded, preset_names()) or folded(name).startswith("oracle-")
+
+
+def list_predicted(run: RunFolder, name: str) -> list[Path]:
+    """Return the cells of a method whose answers came from elsewhere."""
+    cells = (path for path in sorted(run.path.glob("cells/*/*/*.json")) if path.stem.casefold() == folded(name))
+    return [path for path in cells if (stored := run.read_cell(path)) is not None and stored["key"] == NO_KEY]
+
+
+def _require_not_evaluated(run: RunFolder, name: str) -> None:
+    if (run.path / "evaluations" / path_part(name) / "evaluation.json").exists():
+        raise InputError(f"--as {name}: a command was evaluated under this name: choose another")
+
+
 def require_free_name(run: RunFolder, name: str) -> None:
     """Refuse the name of a variant of the run, of a preset or of an oracle, and one that would share its folder.
 
@@ -192,7 +215,7 @@ def require_free_name(run: RunFolder, name: str) -> None:
         require_table_name(name)
     except ValueError as error:
         raise InputError(f"--as {name!r}: {error}") from error
-    if folded(name.partition("[")[0]) in map(folded, preset_names()) or folded(name).startswith("oracle-"):
+    if is_name_of_ours(name):
         raise InputError(f"--as {name}: a preset or an oracle of tunnelcd is called so: choose another")
     for path in sorted(run.path.glob("cells/*/*/*.json")):
         if path.stem.casefold() == folded(name) and (stored := run.read_cell(path)) is not None:

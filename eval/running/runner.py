@@ -170,8 +170,7 @@ def open_pair(
 ) -> tuple[PairStages, GroundTruth] | str:
     """Simulate a pair unless it exists and open it; a text says why it cannot be made. The caller holds its lock."""
     if not _is_simulated(run.pair(pair.name, pair.seed), pair):
-        remove(run.pair(pair.name, pair.seed))
-        remove(run.maps(pair.name, pair.seed))
+        _remove_pair(run, pair)
     return PairRun(run, pair, Made(None), progress, tools).open()
 
 
@@ -255,12 +254,21 @@ def _remove_stale(run: RunFolder, pair: Pair, force: bool) -> None:
     if not pair.todo:
         return
     if force or not (_is_simulated(run.pair(pair.name, pair.seed), pair) or _is_dropped(run, pair)):
-        remove(run.pair(pair.name, pair.seed))
-        remove(run.maps(pair.name, pair.seed))
+        _remove_pair(run, pair)
         remove(dropped_file(run, pair.name, pair.seed))
     for each in pair.todo:
         remove(run.cell(pair.name, pair.seed, each.cell.variant))
         remove(run.answer(pair.name, pair.seed, each.cell.variant))
+
+
+def _remove_pair(run: RunFolder, pair: Pair) -> None:
+    """Remove a pair and its maps, and where it was another world every row and answer about that."""
+    held = run.pair(pair.name, pair.seed)
+    if held.exists() and not _is_simulated(held, pair):
+        for kind in ("cells", "answers"):
+            remove(run.path / kind / held.parent.name / held.name)
+    remove(held)
+    remove(run.maps(pair.name, pair.seed))
 
 
 def _is_dropped(run: RunFolder, pair: Pair) -> bool:

@@ -58,6 +58,7 @@ class CaseScore:
             answer states none), label (1, 0, or -1 for left out).
         surface_changes: One dict per surface change of the truth.
         surface_windows: One dict per window for detection limits.
+        plugins: Columns of the row that metrics of others made.
     """
 
     row: dict[str, Any]
@@ -67,6 +68,7 @@ class CaseScore:
     keyframes: list[dict[str, Any]] = field(default_factory=list)
     surface_changes: list[dict[str, Any]] = field(default_factory=list)
     surface_windows: list[dict[str, Any]] = field(default_factory=list)
+    plugins: frozenset[str] = frozenset()
 
 
 def score(answer: ChangeReport | Path | str, pair: Path | str) -> dict[str, Any]:
@@ -144,12 +146,14 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
         **_list_sizes(answer, truth, n_regions, float(after_travelled_m[-1])),
         **surface.columns,
     }
-    row |= compute_plugin_columns(truth, answer, row)
+    plugin_columns = compute_plugin_columns(truth, answer, row)
+    row |= plugin_columns
     if answer.until == "merge":
-        return CaseScore(row=row, changes=[], regions=[], objects=[])
+        return CaseScore(row=row, changes=[], regions=[], objects=[], plugins=frozenset(plugin_columns))
     judged = zip(truth.before.judged_scans, regions.keyframe_scores, regions.keyframe_labels, strict=True)
     return CaseScore(
         row=row,
+        plugins=frozenset(plugin_columns),
         changes=make_change_rows(regions, (objects, sizes), right, truth, report),
         regions=make_region_rows(report, regions, truth),
         objects=items,

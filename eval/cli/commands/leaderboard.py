@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import typer
 
 from eval.cli.options import Quiet, RunOut, complete_plan
-from eval.core.terminal.printing import count_pairs, echo, say
+from eval.core.terminal.printing import count_pairs, echo, say, warn
 from eval.core.terminal.progress import shown_progress
 
 
@@ -92,6 +92,8 @@ def evaluate(
     n_pairs = outcome.n_done + outcome.n_kept
     told = f"{count_pairs(outcome.n_done)} asked now{kept}; {outcome.n_failed} of {n_pairs} without an answer"
     say(quiet, f"{out}: {told}")
+    if outcome.n_failed_kept:
+        warn(f"{count_pairs(outcome.n_failed_kept)} without an answer are kept from earlier: --force asks all again")
     require_an_answer(run, name)
 
 

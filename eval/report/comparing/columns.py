@@ -64,6 +64,8 @@ def figures_of(results: pd.DataFrame) -> pd.DataFrame:
     }
     stored = [column.key for column in COMPARED if column.key not in (*columns, POOLED) and column.key in results]
     figures = {**columns, **{key: _as_numbers(results, key) for key in stored}}
+    # what a failed answer states of its time is no time of an answer
+    figures |= {key: np.where(results["status"] == "ok", figures[key], np.nan) for key in stored if is_time(key)}
     if (
         "is_alarm" in stored and "is_unchanged_pair" in results
     ):  # who refuses the pairs on which he would cry wolf is not silent

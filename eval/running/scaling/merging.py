@@ -1,9 +1,9 @@
 """Unites run folders of one plan: the shards of a run, or parts of it that machines made.
 
 Every finished cell comes into the new folder once, with its answer. A cell that two folders hold must be the same in
-both: its key, its row and items, and its answer, times apart. Sessions and maps come along as hard links where the
-disks allow it, else as copies. Stored stages and the names of `tunnelcd export` stay behind. The new folder appears
-when it is complete.
+both: its key, its row and items, and its answer, times apart. What `tunnelcd evaluate` keeps comes along, and so do
+sessions and maps, as hard links where the disks allow it, else as copies. Stored stages and the names of `tunnelcd
+export` stay behind. The new folder appears when it is complete.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ from eval.running.scaling.merged_provenance import unite_provenance
 from eval.running.scaling.shards import number_pairs, stored_shard
 
 _ANSWER = ("answer.json", "answer.npz")
+# what two answers of one method share (`eval.leaderboard.evaluation.digest_method`), and the plan that they are of
+_OF_A_METHOD = ("command", "programs", "merge", "limit_s", "plan", "plan_digest", "split")
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +77,7 @@ def merge_runs(
     told = [run.provenance() for run in runs]
     provenance, notes = unite_provenance(list(names) or [str(run.path) for run in runs], told, command)
     _require_outside(out, runs)
+    evaluations = _unite_evaluations(runs)
     sources, n_shared = _find_cells(runs, progress)
     with new_folder(out) as partial:
         merged = RunFolder(partial)
@@ -85,6 +88,7 @@ def merge_runs(
         if keep == "sessions":
             _take_pairs(runs, partial, progress)
         _take_records(runs, partial)
+        _take_evaluations(runs, evaluations, partial)
         write_tables(merged)
         write_json(partial / "provenance.json", {**provenance, "finished": now()})
     progress.cells("done", len(sources), len(sources))
@@ -239,6 +243,38 @@ def _take_records(runs: Sequence[RunFolder], target: Path) -> None:
                 )
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target / name)
+
+
+def _unite_evaluations(runs: Sequence[RunFolder]) -> dict[str, dict[str, Any]]:
+    """Return evaluation.json of each evaluated method with the pairs of all runs; refuse two methods of one name."""
+    united: dict[str, dict[str, Any]] = {}
+    holders: dict[str, Path] = {}
+    for run in runs:
+        for path in sorted(run.path.glob("evaluations/*/evaluation.json")):
+            found, name = read_json(path, "expected a file of `tunnelcd evaluate`"), path.parent.name
+            other = united.setdefault(name, found)
+            differing = [key for key in _OF_A_METHOD if other.get(key) != found.get(key)]
+            if differing:
+                raise InputError(
+                    f"{holders[name]} and {run.path} hold answers of different methods or plans under the name {name} "
+                    f"({differing[0]}): evaluate one of them under another name"
+                )
+            holders.setdefault(name, run.path)
+            pairs = [tuple(pair) for pair in (*other.get("pairs", ()), *found.get("pairs", ()))]
+            united[name] = {**other, "pairs": list(dict.fromkeys(pairs))}
+    return united
+
+
+def _take_evaluations(runs: Sequence[RunFolder], united: Mapping[str, Mapping[str, Any]], target: Path) -> None:
+    for name, document in united.items():
+        folder = target / "evaluations" / name
+        for run in runs:
+            for path in sorted(run.path.glob(f"evaluations/{name}/*/*.json")):
+                place = folder / path.parent.name / path.name
+                place.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path, place)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / "evaluation.json", document)
 
 
 def _link_or_copy(source: str | Path, target: str | Path) -> None:

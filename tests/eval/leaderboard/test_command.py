@@ -38,9 +38,10 @@ def test_a_script_that_is_not_there_is_refused_before_a_pair_is_simulated(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("predict.py").write_text("pass")
-    with pytest.raises(InputError, match=r'predit\.py: no such file in .*; did you mean "predict\.py"'):
-        parse_command(f"{sys.executable} predit.py {WHOLE}", gets_merge=False)
-    for words in ("predict.py", "-m predit.py", "{out}/later.py", "-c pass predit.py"):
+    for words in ("predit.py", "-u predit.py", "-B -u predit.py"):
+        with pytest.raises(InputError, match=r'predit\.py: no such file in .*; did you mean "predict\.py"'):
+            parse_command(f"{sys.executable} {words} {WHOLE}", gets_merge=False)
+    for words in ("-u predict.py", "predict.py", "-m predit.py", "{out}/later.py", "-c pass predit.py"):
         assert parse_command(f"{sys.executable} {words} {WHOLE}", gets_merge=False)
 
 

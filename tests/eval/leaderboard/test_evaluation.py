@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from eval.leaderboard.evaluation import evaluation_folder, read_call, read_evalu
 from eval.leaderboard.given_merge import write_merge
 from eval.leaderboard.submission import pack_submission
 from eval.oracles.merge import OracleMerge, align_by_truth
+from eval.running.predictions import add_predictions
 from eval.running.rescoring import rescore
 from eval.running.stages.pair_stages import PairStages
 from eval.truth.adapters import pipeline_input
@@ -251,3 +253,46 @@ def test_a_pair_that_cannot_be_made_is_a_failed_row_without_scores(evaluator: Ev
     rows = rows_of(evaluator).set_index("scenario")
     assert rows.loc[ONE_BOX, "error"] == "smoke/one_box does not fit"
     assert np.isnan(rows.loc[ONE_BOX, "region_recall"]) and rows.loc["smoke/unchanged", "region_recall"] == 0.0
+
+
+def test_a_command_and_answers_from_elsewhere_do_not_share_a_name(evaluator: Evaluator, tmp_path: Path) -> None:
+    evaluator.evaluate()
+    answers = tmp_path / "answers"
+    for world in (ONE_BOX, "smoke/unchanged"):
+        shutil.copytree(evaluator.run.answer(world, 20000, "mine"), answers / world / "20000")
+    with pytest.raises(InputError, match="--as mine: a command was evaluated under this name"):
+        add_predictions(evaluator.run, answers, "mine")
+    assert add_predictions(evaluator.run, answers, "other") == 2
+    with pytest.raises(InputError, match="--as other: 2 answers of this name came from elsewhere"):
+        evaluator.evaluate(LATER, name="other")
+    assert evaluator.evaluate(LATER, name="other", force=True).n_done == 2
+    assert rows_of(evaluator, "other")["t_cd_s"].tolist() == [0.7, 0.7]
+
+
+def test_failures_that_are_kept_are_told(evaluator: Evaluator) -> None:
+    assert evaluator.evaluate("raise SystemExit(1)").n_failed_kept == 0
+    outcome = evaluator.evaluate("raise SystemExit(1)")
+    assert (outcome.n_done, outcome.n_failed, outcome.n_failed_kept) == (0, 2, 2)
+
+
+def test_rows_of_an_old_command_stand_in_no_table_after_an_interrupt(evaluator: Evaluator) -> None:
+    evaluator.evaluate()
+    evaluator.evaluate(name="other")
+    (evaluation_folder(evaluator.run, "mine") / "table.csv").write_text("old")
+    with pytest.raises(KeyboardInterrupt):
+        evaluator.evaluate(LATER, force=True, progress=Interrupted())
+    assert len(rows_of(evaluator)) == 0 and len(rows_of(evaluator, "other")) == 2
+    assert not (evaluation_folder(evaluator.run, "mine") / "table.csv").exists()
+
+
+def test_rows_about_another_world_go_with_its_pair(evaluator: Evaluator) -> None:
+    evaluator.evaluate(name="old")
+    changed = load_scenario(ONE_BOX, 20000).model_copy(update={"description": "another world"})
+
+    def draw(name: str, seed: int, settings: tuple[str, ...] = ()) -> Scenario:
+        return changed if name == ONE_BOX else load_scenario(name, seed, settings)
+
+    evaluator.evaluate(tools=replace(TOOLS, draw=draw))
+    assert rows_of(evaluator, "old")["scenario"].tolist() == ["smoke/unchanged"]
+    assert not evaluator.run.answer(ONE_BOX, 20000, "old").exists()
+    assert len(rows_of(evaluator)) == 2

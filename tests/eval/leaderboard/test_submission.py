@@ -18,6 +18,7 @@ from eval.leaderboard.evaluation import digest_method, read_evaluation
 from eval.leaderboard.page import write_leaderboard
 from eval.leaderboard.submission import CheckedFile, pack_submission, read_submission, score_again
 from eval.running.runfolder import RunFolder
+from eval.scoring import scoring
 
 ONE_BOX = "smoke/one_box"
 Change = Callable[[dict[str, bytes]], None]
@@ -348,3 +349,26 @@ def test_an_evaluation_that_cannot_be_is_one_line(run: RunFolder, tmp_path: Path
     with pytest.raises(InputError, match="split") as caught:
         pack_submission(run, "mine", tmp_path / "x.zip")
     assert "\n" not in str(caught.value) and not (tmp_path / "x.zip").exists()
+
+
+def test_a_metric_of_the_organiser_is_no_forgery(
+    evaluated: RunFolder, packed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scoring, "compute_plugin_columns", lambda *_: {"largest_object": 3.0})
+    assert score_again(read_submission(packed), evaluated) == 2
+
+
+def test_no_submission_is_called_as_a_method_of_ours(packed: Path) -> None:
+    def rename(document: dict[str, Any]) -> None:
+        document["name"] = "tunnelcd"
+        for pair in document["pairs"]:
+            pair["row"]["variant"] = "tunnelcd"
+
+    with pytest.raises(InputError, match="a preset or an oracle of tunnelcd is called tunnelcd"):
+        read_submission(rewrite(packed, in_manifest(rename)))
+
+
+def test_a_reference_that_was_given_the_merge_is_told(packed: Path, evaluated: RunFolder, tmp_path: Path) -> None:
+    other = renamed(read_submission(packed), "theirs")
+    write_leaderboard([other], tmp_path / "b.html", evaluated.path, [0])
+    assert (tmp_path / "b.html").read_text().count("told the true one") == 2

@@ -15,7 +15,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import transform
+from eval.running.predictions import evaluate
 from eval.running.runfolder import RunFolder, write_json
 from eval.scoring import answer_check
 from eval.scoring.scoring import METRICS_VERSION
@@ -434,3 +436,10 @@ def test_an_answer_that_was_never_scored_is_not_replaced(
     for name in ("answer.json", "answer.npz"):
         shutil.copyfile(tmp_path / f"mine/tiny/pair/{SEEDS[0]}" / name, answer / name)
     assert command(*argv)[0] == 0
+
+
+def test_a_function_that_writes_nothing_is_told_at_its_first_pair(run: RunFolder) -> None:
+    asked = []
+    with pytest.raises(InputError, match=r"pair 1 of 2: the function wrote no answer\.json to its second argument"):
+        evaluate(lambda pair, _: asked.append(pair), run.path, "mine")
+    assert len(asked) == 1

@@ -206,3 +206,23 @@ def test_merge_runs_from_the_command_line(tmp_path: Path, command: Command, shar
     assert (code, err) == (2, "error: merge-runs unites two run folders or more: name them all\n")
     code, _, err = command("merge-runs", shards[0], shards[1], "--out", shards[1] / "in")
     assert code == 2 and "lies in the run folder" in err and not (shards[1] / "in").exists()
+
+
+def test_what_was_evaluated_comes_along_and_two_methods_of_one_name_do_not(
+    tmp_path: Path, shards: Sequence[Path]
+) -> None:
+    copies = [shutil.copytree(shard, tmp_path / shard.name) for shard in shards[:2]]
+    for number, copy in enumerate(copies):
+        folder = copy / "evaluations" / "mine"
+        (folder / "world").mkdir(parents=True)
+        document = {"command": ["python", "m.py"], "merge": "own", "limit_s": 60.0, "pairs": [["world", number]]}
+        (folder / "evaluation.json").write_text(json.dumps(document))
+        (folder / "world" / f"{number}.json").write_text("{}")
+    merge_runs(copies, tmp_path / "run", keep="answers")
+    united = tmp_path / "run" / "evaluations" / "mine"
+    assert json.loads((united / "evaluation.json").read_text())["pairs"] == [["world", 0], ["world", 1]]
+    assert sorted(path.name for path in (united / "world").iterdir()) == ["0.json", "1.json"]
+    other = copies[1] / "evaluations" / "mine" / "evaluation.json"
+    other.write_text(json.dumps({**json.loads(other.read_text()), "merge": "given"}))
+    with pytest.raises(InputError, match=r"under the name mine \(merge\): evaluate one of them"):
+        merge_runs(copies, tmp_path / "two", keep="answers")
