@@ -27,6 +27,9 @@ def centre_regions(
     smallest ball around them, too. If a ball is larger than the sphere, the objects with the fewest points are left
     out.
 
+    An object is followed out of the spheres, so it may lie in none that is reported. The best candidate whose sphere
+    holds its centroid is then reported, too, and centred on it, whatever its score.
+
     Of an object the part within 1.5 m of the sphere counts. Scores, order, radius and regions without objects stay as
     they are.
 
@@ -58,6 +61,13 @@ def centre_regions(
             centred.append(region)
         elif parts and withdraw:
             is_reported[region] = False
+    for group in groups:
+        place = group.points_map.mean(axis=0)
+        if _is_within(place, centres[is_reported], regions.radii_m[is_reported]):
+            continue
+        holding = np.linalg.norm(regions.centres_map - place, axis=1) <= regions.radii_m
+        if len(found := np.flatnonzero(holding & ~is_reported)):
+            centres[found[0]], is_reported[found[0]] = place, True
     moved = replace(
         regions,
         centres_map=centres,

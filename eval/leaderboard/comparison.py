@@ -11,8 +11,9 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
+from eval.core.domains import domain_name
 from eval.core.output import make_writable
-from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
+from eval.core.statistics import bootstrap_interval, clustered_interval, mean, median, statistic_of
 from eval.core.terminal.printing import count_pairs
 from eval.leaderboard.evaluation import list_merges
 from eval.leaderboard.reference import take_other_methods
@@ -21,7 +22,8 @@ from eval.report.comparing.differences import NOT_JUDGED, paired_differences, ve
 from eval.report.render import write_file
 from eval.running.results.run_data import RunData
 from eval.running.results.sides import find_other_worlds
-from eval.tables.rows import PAIR, is_told_the_truth, numbers, stated
+from eval.tables.conditions import odometry_of
+from eval.tables.rows import PAIR, is_told_the_truth, numbers, stated, tunnels_of
 
 FIGURES = ("region_recall", "false_regions_per_100m", "object_iou_point", "object_f1_50", "t_total_s")
 HEADINGS = ("recall", "false/100m", "IoU", "F1 at 0.5", "time [s]")
@@ -38,10 +40,12 @@ class Comparison:
     """A method and the reference.
 
     Attributes:
-        table: One row per method, the evaluated one first: method, n_pairs, n_answered, and of each of `FIGURES` the
-            value with the ends of its 95 % interval over pairs, `<figure>_low` and `_high`.
+        table: One row per kind of pairs (`part_pairs`) and method, the evaluated one first: `part`, method, n_pairs,
+            n_answered, and of each of `FIGURES` the value with the ends of its 95 % interval, `<figure>_low` and
+            `_high`.
         pairs: One row per pair and reference method: the figures of both, and their differences.
-        paired: One row per reference method and figure: the mean difference with its interval, and a verdict.
+        paired: One row per kind of pairs, reference method and figure: the mean difference with its interval, and a
+            verdict.
         notes: What a reader of the tables must know, one sentence each.
     """
 
@@ -66,13 +70,17 @@ def compare_with_reference(results: pd.DataFrame, name: str, references: Sequenc
     others = {variant: rows.loc[rows.index.intersection(own.index)] for variant, rows in list_variants(references)}
     others = {variant: rows for variant, rows in others.items() if len(rows)}
     shared = own.index if not others else own.index[own.index.isin(_union(others))]
-    rows = [summarise_figures(variant, each) for variant, each in {name: own.loc[shared], **others}.items()]
-    paired = [
-        {"reference": variant, "n_pairs": len(rows), **row,
-         "verdict": NOT_JUDGED if is_time(row["metric"]) else verdict(row)}
-        for variant, rows in others.items()
-        for row in paired_differences(_stated(rows), _stated(own.loc[rows.index]))
-    ]  # fmt: skip
+    rows, paired = [], []
+    for part, members in part_pairs(own.loc[shared]).items():
+        of_part = {variant: each.loc[each.index.intersection(members)] for variant, each in others.items()}
+        tables = {name: own.loc[members], **{variant: each for variant, each in of_part.items() if len(each)}}
+        rows += [{"part": part, **summarise_figures(variant, each)} for variant, each in tables.items()]
+        paired += [
+            {"part": part, "reference": variant, "n_pairs": len(each), **row,
+             "verdict": NOT_JUDGED if is_time(row["metric"]) else verdict(row)}
+            for variant, each in tables.items() if variant != name
+            for row in paired_differences(_stated(each), _stated(own.loc[each.index]))
+        ]  # fmt: skip
     pairs = pd.DataFrame(list(_by_pair(own, others, calls)))
     return Comparison(
         pd.DataFrame(rows),
@@ -95,8 +103,11 @@ def write_tables_of(found: Comparison, folder: Path) -> None:
 
 def list_lines(found: Comparison) -> list[str]:
     """Return the table and what was found as lines of at most 80 characters: below each mean stands its interval."""
-    lines = [_line("method", "pairs", HEADINGS)]
+    lines, part = [_line("method", "pairs", HEADINGS)], ""
     for row in found.table.to_dict("records"):
+        if row["part"] != part:
+            part = str(row["part"])
+            lines.append(f"{part}:")
         name = str(row["method"])
         name = name if len(name) < _NAME_WIDTH else f"{name[: _NAME_WIDTH - 2]}\u2026"
         spans = [show_span(key, row[f"{key}_low"], row[f"{key}_high"]) for key in FIGURES]
@@ -117,7 +128,11 @@ def _list_differences(found: Comparison) -> Iterator[str]:
     names = list(dict.fromkeys(found.paired["reference"]))
     main = _MAIN_REFERENCE if _MAIN_REFERENCE in names else names[0]
     yield f"pair by pair, {found.table['method'].iloc[0]} less {main}:"
+    part = ""
     for row in found.paired[found.paired["reference"] == main].to_dict("records"):
+        if row["part"] != part:
+            part = str(row["part"])
+            yield f" {part}:"
         heading = HEADINGS[FIGURES.index(row["metric"])]
         low, difference, high = (show_figure(row["metric"], row[name]) for name in ("low", "difference", "high"))
         span = "" if math.isnan(row["low"]) else f" ({low} to {high})"
@@ -126,9 +141,27 @@ def _list_differences(found: Comparison) -> Iterator[str]:
 
 def take_figures(results: pd.DataFrame) -> pd.DataFrame:
     """Return the figures by pair, with `status` and every one of `FIGURES`."""
-    found = figures_of(results).assign(status=results["status"].to_numpy())
+    found = figures_of(results).assign(status=results["status"].to_numpy(), odometry=odometry_of(results))
     found = found.assign(**{key: numbers(found, key) for key in FIGURES})
-    return found.set_index(PAIR)[["domain", "variant", "status", *FIGURES]]
+    return found.set_index(PAIR)[["domain", "odometry", "variant", "status", *FIGURES]]
+
+
+def part_pairs(figures: pd.DataFrame) -> dict[str, pd.Index[Any]]:
+    """Return the pairs (scenario, seed) of each kind that figures are told apart for: domain and odometry.
+
+    The name of a kind is "" where there is one alone. A pair that cannot be made does not tell its odometry, and is
+    with the first.
+    """
+    odometry = figures["odometry"].astype(str)
+    names = [name for name in dict.fromkeys(odometry) if name]
+    odometry = odometry.where(odometry != "", names[0] if names else "")
+    by = ", odometry " if len(names) > 1 else ""
+    kinds = [
+        f"{domain_name(domain)}{by}{name if by else ''}"
+        for domain, name in zip(figures["domain"], odometry, strict=True)
+    ]
+    found = {kind: figures.index[[each == kind for each in kinds]] for kind in sorted(set(kinds))}
+    return found if len(found) > 1 else {"": figures.index}
 
 
 def list_variants(references: Sequence[RunData]) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -157,7 +190,10 @@ def summarise_figures(name: str, rows: pd.DataFrame) -> dict[str, Any]:
     for key in FIGURES:
         values, statistic = stated(rows, key), statistic_of(key)
         row[key] = median(values) if statistic == "median" else mean(values)
+        is_number, tunnels = ~np.isnan(values), tunnels_of(rows.index.to_frame())
         row[f"{key}_low"], row[f"{key}_high"] = bootstrap_interval(values, statistic)
+        if len(np.unique(tunnels)) < len(tunnels):
+            row[f"{key}_low"], row[f"{key}_high"] = clustered_interval(values[is_number], tunnels[is_number], statistic)
         row[f"{key}_n"] = int(np.count_nonzero(~np.isnan(values)))
     return row
 

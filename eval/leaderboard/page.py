@@ -19,6 +19,7 @@ from eval.leaderboard.comparison import (
     SHOWN,
     list_variants,
     note_other_worlds,
+    part_pairs,
     show_figure,
     show_span,
     summarise_figures,
@@ -74,7 +75,7 @@ def write_leaderboard(files: Sequence[CheckedFile], out: Path, reference: Path |
     if out.suffix != ".html" or out.is_dir():
         raise InputError(f"--out {out}: expected the name of a file that ends in .html")
     require_replaceable(out, _HEAD, "page of `tunnelcd leaderboard`")
-    boards = [_make_board(group, reference) for group in _group(files)]
+    boards = [board for group in _group(files) for board in _make_boards(group, reference)]
     told = [
         {"name": each.content.name, "file": each.path.name, "sha256": each.sha256, "content": each.content,
          "command": " ".join(each.content.command), "n_checked": n,
@@ -102,20 +103,28 @@ def _group(files: Sequence[CheckedFile]) -> list[list[CheckedFile]]:
     return list(groups.values())
 
 
-def _make_board(group: Sequence[CheckedFile], reference: Path | None) -> Board:
+def _make_boards(group: Sequence[CheckedFile], reference: Path | None) -> Iterator[Board]:
+    """Yield a table for each kind of pairs (`part_pairs`); the notes stand below the last."""
     first = group[0].content
     data = find_reference(first.plan, reference)
     own = {each.content.name: take_figures(_rows(each)) for each in group}
-    pairs = own[first.name].index
-    rows = [(summarise_figures(name, found), _MERGES[each.content.merge], False)
-            for (name, found), each in zip(own.items(), group, strict=True)]  # fmt: skip
-    # a run in which a method was evaluated holds its rows, too
-    references = [(name, found) for name, found in _list_references(data, pairs) if name not in own]
     merges = {} if data is None else {name: _MERGES[merge] for name, merge in list_merges(data.folder).items()}
-    rows += [(summarise_figures(name, found), merges.get(name, ""), True) for name, found in references]
-    rows.sort(key=lambda row: _place(row[0]))
-    title = f"Plan {first.plan}, {count_pairs(len(pairs))}{f', {first.split}' if first.split else ''}"
-    return Board(title, tuple(_line(*row) for row in rows), tuple(_notes(group, data, len(pairs), rows)))
+    parts = part_pairs(own[first.name])
+    for part, pairs in parts.items():
+        rows = [(summarise_figures(name, found.loc[pairs]), _MERGES[each.content.merge], False)
+                for (name, found), each in zip(own.items(), group, strict=True)]  # fmt: skip
+        # a run in which a method was evaluated holds its rows, too
+        references = [(name, found) for name, found in _list_references(data, pairs) if name not in own]
+        rows += [(summarise_figures(name, found), merges.get(name, ""), True) for name, found in references]
+        rows.sort(key=lambda row: _place(row[0]))
+        told = [
+            f"Plan {first.plan}",
+            *([part] if part else []),
+            count_pairs(len(pairs)),
+            *([first.split] if first.split else []),
+        ]
+        notes = _notes(group, data, len(pairs), rows) if part == [*parts][-1] else ()
+        yield Board(", ".join(told), tuple(_line(*row) for row in rows), tuple(notes))
 
 
 def _rows(each: CheckedFile) -> pd.DataFrame:

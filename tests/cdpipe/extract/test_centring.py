@@ -168,3 +168,15 @@ def test_extraction_centres_the_region_of_the_surface_rule_alone() -> None:
 def test_settings_name_the_centre_only_where_it_stays() -> None:
     assert "recentre" not in load_config("paper").model_dump()["extract"]
     assert load_config("tunnelcd", ["extract.recentre=false"]).model_dump()["extract"]["recentre"] is False
+
+
+def test_an_object_that_was_followed_out_of_all_regions_has_the_best_candidate_that_holds_it() -> None:
+    proposed = regions((0, 0), (6, 0), (8, 0), n_reported=1)
+    found, groups = centre_regions(proposed, [group(1.0), group(5.5), group(6.5, points=MANY)])
+    assert found.is_reported.tolist() == [True, True, False]
+    np.testing.assert_allclose(found.centres_map[1], (5.5, 0, 0), atol=1e-9)
+    assert found.is_withdrawn is not None and not found.is_withdrawn.any()
+    assert [each.region for each in groups] == [0, 1, 1]
+    # no candidate holds it: it stays without a region of its own
+    alone, _ = centre_regions(regions((0, 0), (30, 0), n_reported=1), [group(1.0), group(9.0)])
+    assert alone.is_reported.tolist() == [True, False]

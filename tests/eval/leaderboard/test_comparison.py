@@ -153,3 +153,24 @@ def test_references_are_found_by_folder_and_by_plan(tmp_path: Path) -> None:
     read(tmp_path / "old", table().assign(metrics_version=1))
     with pytest.raises(InputError, match="metrics version 1"):
         find_reference("x", tmp_path / "old")
+
+
+def test_domains_and_odometries_are_apart(tmp_path: Path) -> None:
+    parts = [
+        table().assign(scenario=world, family=world, odometry_before=odometry, odometry_after=odometry)
+        for world, odometry in (("narrow", "drift"), ("cave", "drift"), ("wide", "kiss-icp"))
+    ]
+    parts[1].loc[parts[1]["variant"] == "mine", "region_recall"] = 0.25
+    frame = pd.concat(parts, ignore_index=True)
+    data = take_other_methods(read(tmp_path / "run", frame), "mine")
+    found = compare_with_reference(own(frame), "mine", [data], {})
+    rows = found.table[found.table["method"] == "mine"].set_index("part")
+    assert rows["n_pairs"].to_dict() == {
+        "in distribution, odometry drift": 3, "in distribution, odometry kiss-icp": 3,
+        "out of distribution, odometry drift": 3,
+    }  # fmt: skip
+    assert rows.loc["out of distribution, odometry drift", "region_recall"] == 0.25
+    lines = list_lines(found)
+    assert lines[1] == "in distribution, odometry drift:" and max(map(len, lines)) <= 80
+    assert sum(line.endswith("odometry drift:") for line in lines) == 4
+    assert set(found.paired["n_pairs"]) == {3}

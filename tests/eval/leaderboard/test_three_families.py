@@ -50,4 +50,5 @@ def test_the_documented_scripts_get_from_a_plan_to_the_page(
     code, _, err = command("leaderboard", "told.zip", "template.zip", "--out", "board.html")
     assert code == 0, err
     page = Path("board.html").read_text()
-    assert "Plan two, 2 pairs" in page and "Plan one, 1 pair<" in page
+    assert "Plan two, in distribution, 1 pair<" in page and "Plan two, out of distribution, 1 pair<" in page
+    assert "Plan one, 1 pair<" in page
