@@ -74,7 +74,7 @@ def _size_plot(groups: pd.DataFrame, data: RunData, main: str) -> Chart:
         "Point IoU by the size of the object",
         Drawing([panels], 325),
         f"A dot for every observable object, answered by {main}, missed ones at 0; lines: means of each method in bins "
-        f"of the hull's volume; bars: 95 % interval over pairs of {main}.",
+        f"of the hull's volume; bars: 95 % interval of {main}, drawn over tunnels.",
     )
 
 

@@ -19,7 +19,7 @@ _ms = scaled(1000.0)
 OBJECT_COLUMNS = (
     Column("object_iou_point", "point IoU", "high", share,
            "Returns shared by answer and truth, of those in either, one per 0.1 m cell; mean over the observable "
-           "changes of a pair, missed ones 0, then over pairs. Below it the 95 % bootstrap interval over pairs."),
+           "changes of a pair, missed ones 0, then over pairs. Below it the 95 % interval, drawn over tunnels."),
     Column("iou_matched_median", "of those matched", "high", share,
            "Median over the objects that were matched at all, all pairs together.",
            "Undefined where none was matched."),

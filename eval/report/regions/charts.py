@@ -108,8 +108,8 @@ def draw_sizes(sizes: pd.DataFrame, table: pd.DataFrame, first: Sequence[str]) -
         rows += [row] if row else []
     others = "" if len(shown) == table["variant"].nunique() else " All methods are in regions_by_size.csv."
     caption = (
-        f"At {RATES_PER_100M[0]:g} false regions per 100 m. n: observable changes of the bin; bars: 95 % interval over "
-        f"pairs of {shown[-1]}.{others}"
+        f"At {RATES_PER_100M[0]:g} false regions per 100 m. n: observable changes of the bin; bars: 95 % interval of "
+        f"{shown[-1]}, drawn over tunnels with the threshold held fixed.{others}"
     )
     title = "Recall by what a change is like"
     return Chart("recall_by_size", title, Drawing(rows, 260), caption, has_png=True) if rows else None

@@ -28,7 +28,7 @@ _ms = scaled(1000.0)
 REGION_COLUMNS = (
     Column("region_auroc", "AUROC", "high", share,
            "How well scores tell places near a change from places far from any; mean over pairs, 0.5 for one without "
-           "an answer, below it the 95 % bootstrap interval over pairs.",
+           "an answer, below it the 95 % bootstrap interval, drawn over tunnels.",
            "Undefined for a pair with places of one class only."),
     Column("region_auroc_pooled", "pooled", "high", share,
            "The same over all places of all pairs at once, scores as they are."),
