@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 from safetensors.torch import save
 from torch import nn
 
@@ -101,8 +102,10 @@ def test_checkpoints_are_those_that_a_method_uses(tmp_path: Path) -> None:
     assert found["range-net"] == digest(numbered_checkpoint_bytes(network)) and "sphere" not in found
     # the paper compares scans; a hand-made descriptor has no file
     assert list(list_checkpoints(PipelineConfig(sphere=mine))) == ["3deg"]
-    by_hand = PipelineConfig(descriptor=DescriptorConfig(method="solid", weights="none.safetensors"))
+    by_hand = PipelineConfig(descriptor=DescriptorConfig(method="solid"))
     assert list_checkpoints(by_hand)["solid"].startswith("version")
+    with pytest.raises(ValidationError, match="descriptor.method = solid has no weights of its own: expected 3deg"):
+        DescriptorConfig(method="solid", weights="none.safetensors")
 
 
 @pytest.mark.parametrize("find", [digest_of_scans, digest_of_spheres, digest_of_range_net])
