@@ -104,7 +104,7 @@ def test_checkpoints_are_those_that_a_method_uses(tmp_path: Path) -> None:
     assert list(list_checkpoints(PipelineConfig(sphere=mine))) == ["3deg"]
     by_hand = PipelineConfig(descriptor=DescriptorConfig(method="solid"))
     assert list_checkpoints(by_hand)["solid"].startswith("version")
-    with pytest.raises(ValidationError, match="descriptor.method = solid has no weights of its own: expected 3deg"):
+    with pytest.raises(ValidationError, match=r"descriptor\.method = solid has no weights of its own: expected 3deg"):
         DescriptorConfig(method="solid", weights="none.safetensors")
 
 
