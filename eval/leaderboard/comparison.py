@@ -13,7 +13,7 @@ import pandas as pd
 
 from eval.core.domains import domain_name
 from eval.core.output import make_writable
-from eval.core.statistics import bootstrap_interval, clustered_interval, mean, median, statistic_of
+from eval.core.statistics import mean, median, statistic_of
 from eval.core.terminal.printing import count_pairs
 from eval.leaderboard.evaluation import list_merges
 from eval.leaderboard.reference import take_other_methods
@@ -23,7 +23,7 @@ from eval.report.render import write_file
 from eval.running.results.run_data import RunData
 from eval.running.results.sides import find_other_worlds
 from eval.tables.conditions import odometry_of
-from eval.tables.rows import PAIR, is_told_the_truth, numbers, stated, tunnels_of
+from eval.tables.rows import PAIR, interval_over_tunnels, is_told_the_truth, numbers, stated, tunnels_of
 
 FIGURES = ("region_recall", "false_regions_per_100m", "object_iou_point", "object_f1_50", "t_total_s")
 HEADINGS = ("recall", "false/100m", "IoU", "F1 at 0.5", "time [s]")
@@ -190,10 +190,8 @@ def summarise_figures(name: str, rows: pd.DataFrame) -> dict[str, Any]:
     for key in FIGURES:
         values, statistic = stated(rows, key), statistic_of(key)
         row[key] = median(values) if statistic == "median" else mean(values)
-        is_number, tunnels = ~np.isnan(values), tunnels_of(rows.index.to_frame())
-        row[f"{key}_low"], row[f"{key}_high"] = bootstrap_interval(values, statistic)
-        if len(np.unique(tunnels)) < len(tunnels):
-            row[f"{key}_low"], row[f"{key}_high"] = clustered_interval(values[is_number], tunnels[is_number], statistic)
+        tunnels = tunnels_of(rows.index.to_frame())
+        row[f"{key}_low"], row[f"{key}_high"] = interval_over_tunnels(values, tunnels, statistic)
         row[f"{key}_n"] = int(np.count_nonzero(~np.isnan(values)))
     return row
 

@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
-from cdpipe.core.geometry import Float64Array
-from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
+from cdpipe.core.geometry import Float64Array, Int64Array
+from eval.core.statistics import mean, median, statistic_of
 from eval.report.comparing.columns import COMPARED, figures_of, is_time
 from eval.report.merge.tables import name_kinds
 from eval.report.pooled import POOLED, pooled_recalls
@@ -31,10 +30,12 @@ from eval.tables.rows import (
     DOMAINS,
     PAIR,
     by_domain,
+    interval_over_tunnels,
     is_told_the_truth,
     numbers,
     records,
     stated,
+    tunnels_of,
     with_domain,
 )
 from eval.tables.surface.table import limit_column
@@ -89,14 +90,15 @@ def means_by_method(results: pd.DataFrame, columns: Sequence[Column]) -> pd.Data
     for domain, cases in by_domain(results):
         for variant, own in cases.groupby("variant", sort=False):
             row: dict[str, Any] = {"domain": domain, "variant": str(variant), "n_pairs": len(own)}
+            tunnels = tunnels_of(own)
             for column in columns:
-                row |= _mean(stated(own, column.key), column.key)
+                row |= _mean(stated(own, column.key), tunnels, column.key)
             rows.append(row)
     return pd.DataFrame(rows)
 
 
-def _mean(values: Float64Array, key: str) -> dict[str, float]:
-    low, high = bootstrap_interval(values[~np.isnan(values)], statistic_of(key))
+def _mean(values: Float64Array, tunnels: Int64Array, key: str) -> dict[str, float]:
+    low, high = interval_over_tunnels(values, tunnels, statistic_of(key))
     return {key: (median if is_time(key) else mean)(values), f"{key}_low": low, f"{key}_high": high}
 
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array
-from eval.core.statistics import bootstrap_interval, mean, median, statistic_of
+from eval.core.statistics import mean, median, statistic_of
+from eval.tables.rows import interval_over_tunnels, tunnel_numbers
 
 Row = Mapping[str, Any]
 
@@ -49,8 +50,11 @@ def over_pairs(rows: Iterable[Row], column: str) -> float:
 
 
 def interval_over_pairs(rows: Iterable[Row], column: str) -> tuple[float, float]:
-    """Return the 95 % bootstrap interval of `over_pairs`; NaN for fewer than two defined values."""
-    return bootstrap_interval(np.array([number(row, column) for row in rows], np.float64), statistic_of(column))
+    """Return the 95 % bootstrap interval of `over_pairs`, drawn over tunnels; NaN for fewer than two."""
+    found = list(rows)
+    values = np.array([number(row, column) for row in found], np.float64)
+    tunnels = tunnel_numbers((text(row, "scenario") for row in found), (int(row.get("seed", 0)) for row in found))
+    return interval_over_tunnels(values, tunnels, statistic_of(column))
 
 
 def select_rows(rows: Iterable[Row], **wanted: Any) -> list[Row]:

@@ -7,8 +7,10 @@ import pandas as pd
 import pytest
 
 from eval.core.statistics import mean_with_interval, paired_difference
+from eval.report.comparing.columns import COMPARED
+from eval.report.summary import means_by_method
 from eval.tables.regions.curves import ranked_pairs, resampled_recalls
-from eval.tables.rows import count_failed, means_with_intervals, tunnel_numbers
+from eval.tables.rows import count_failed, means_with_intervals, tunnel_numbers, with_domain
 
 TWINS = ("narrow", "dust/narrow", "dust/mist", "narrow[sensor.sub_rays=1]")
 
@@ -48,3 +50,15 @@ def test_twins_are_drawn_together_in_pooled_recall() -> None:
         return resampled_recalls(ranked, 0.1)
 
     np.testing.assert_array_equal(drawn(("narrow",)), drawn(TWINS))
+
+
+def test_the_headline_of_a_page_draws_tunnels() -> None:
+    values = {3: 0.2, 4: 0.5, 7: 0.9}
+    rows = [
+        {"scenario": world, "family": "narrow", "seed": seed, "variant": "ours", "status": "ok", "region_recall": value}
+        for world in TWINS for seed, value in values.items()
+    ]  # fmt: skip
+    column = next(column for column in COMPARED if column.key == "region_recall")
+    (row,) = means_by_method(with_domain(rows), [column]).query("domain == 'in'").to_dict("records")
+    _, low, high, _ = mean_with_interval(np.array(list(values.values())))
+    assert (row["region_recall_low"], row["region_recall_high"]) == pytest.approx((low, high))
