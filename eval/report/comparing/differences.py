@@ -165,6 +165,15 @@ def is_told_apart(
 ) -> bool | None:
     """Tell whether two methods of a run differ beyond noise in a column; None where it has no number for each pair.
 
+    Arguments as of `judge_methods`.
+    """
+    found = judge_methods(of_method, column, first, second, data)
+    return found in (BETTER, WORSE) if found else None
+
+
+def judge_methods(of_method: Mapping[str, pd.DataFrame], column: Column, first: str, second: str, data: RunData) -> str:
+    """Return the verdict on the difference of two methods of a run; "" where there is no number for each pair.
+
     Args:
         of_method: Figures of each method, a row for each session pair, by scenario and seed.
         column: The column.
@@ -182,7 +191,7 @@ def is_told_apart(
         rows = [paired_difference(a, b, tunnels=tunnels)]
     else:
         rows = []
-    return verdict({"good": "high", **rows[0]}) in (BETTER, WORSE) if rows else None
+    return verdict({"good": "high", **rows[0]}) if rows else ""
 
 
 def _place(row: Mapping[str, Any]) -> tuple[bool, int, str]:

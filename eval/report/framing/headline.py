@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from eval.core.domains import domain_name
-from eval.report.comparing.differences import is_told_apart
+from eval.report.comparing.differences import NOISE, SAME, TOO_FEW, judge_methods
 from eval.report.hardness import count_held, name_breaks
 from eval.report.summary import HEADLINES, rank_methods
 from eval.report.surface.surface import SURFACE_COLUMNS
@@ -57,7 +57,7 @@ def write_answer(data: RunData, merges: pd.DataFrame) -> str:
 
 
 def name_leaders(
-    values: Iterable[tuple[str, float]], column: Column, is_apart: Callable[[str, str], bool | None] | None = None
+    values: Iterable[tuple[str, float]], column: Column, judge: Callable[[str, str], str] | None = None
 ) -> str:
     """Return the methods with the best value as written, and those that come next; "" without two methods.
 
@@ -66,8 +66,8 @@ def name_leaders(
     Args:
         values: Name and value of each method, NaN where it is undefined.
         column: Which direction wins, and how values are written.
-        is_apart: Tells whether two methods differ beyond noise. The sentence says so of the first of the best and the
-            first of the next, which are not "before" one another otherwise.
+        judge: Gives the verdict on two methods. The first of the best is "before" the first of the next only where
+            they differ beyond noise, or where there are too few pairs to tell, which is said.
     """
     fair = [(name, value) for name, value in values if not is_told_the_truth(name) and math.isfinite(value)]
     if len(fair) < 2:
@@ -80,8 +80,10 @@ def name_leaders(
     if not others:
         return f"all {len(leaders)} methods alike ({best})"
     second, followers = others[0]
-    link = "not told from" if is_apart is not None and is_apart(leaders[0], followers[0]) is False else "before"
-    return f"{_joined(leaders)} ({best}), {link} {_joined(followers)} ({second})"
+    found = judge(leaders[0], followers[0]) if judge is not None else ""
+    link = "not told from" if found in (NOISE, SAME) else "before"
+    told = f"{_joined(leaders)} ({best}), {link} {_joined(followers)} ({second})"
+    return f"{told}, on too few pairs for a verdict" if found == TOO_FEW else told
 
 
 def _joined(names: Sequence[str]) -> str:
@@ -123,10 +125,10 @@ def name_without_shared(variants: Iterable[str]) -> tuple[str, dict[str, str]]:
     return ", ".join(each for each in next(iter(settings.values())) if each in shared), found
 
 
-def _told(table: pd.DataFrame, column: Column, is_apart: Callable[[str, str, str], bool | None] | None = None) -> str:
+def _told(table: pd.DataFrame, column: Column, judge: Callable[[str, str, str], str] | None = None) -> str:
     """Return who leads in every domain of a table, by one of its columns.
 
-    `is_apart(domain, a, b)` tells whether two methods differ beyond noise there.
+    `judge(domain, a, b)` gives the verdict on two methods there.
     """
     names = table["variant"].astype(str)
     fair = names[~names.map(is_told_the_truth)]
@@ -140,8 +142,8 @@ def _told(table: pd.DataFrame, column: Column, is_apart: Callable[[str, str, str
         if domain == ALL_DOMAINS and table["domain"].nunique() > 1:
             continue
         named = {shown: name for name, shown in values.items()}
-        apart = partial(_is_apart_by_name, is_apart, str(domain), named) if is_apart is not None else None
-        leaders = name_leaders(zip(own["variant"], numbers(own, column.key), strict=True), column, apart)
+        own_judge = partial(_judge_by_name, judge, str(domain), named) if judge is not None else None
+        leaders = name_leaders(zip(own["variant"], numbers(own, column.key), strict=True), column, own_judge)
         parts += [f"{domain_name(str(domain))}: {leaders}"] if leaders else []
     extreme = "Highest" if column.better == "high" else "Lowest"
     return f"{extreme} {column.heading}{by}, {'; '.join(parts)}." if parts else ""
@@ -153,18 +155,18 @@ def _of_pairs(data: RunData) -> str:
     if column is None:
         return ""
 
-    def is_apart(domain: str, first: str, second: str) -> bool | None:
+    def judge(domain: str, first: str, second: str) -> str:
         own = figures[figures["domain"] == domain]
         of_method = {name: own[own["variant"] == name].set_index(PAIR) for name in (first, second)}
-        return is_told_apart(of_method, column, first, second, data)
+        return judge_methods(of_method, column, first, second, data)
 
-    return _told(ranked, column, is_apart)
+    return _told(ranked, column, judge)
 
 
-def _is_apart_by_name(
-    is_apart: Callable[[str, str, str], bool | None], domain: str, named: Mapping[str, str], first: str, second: str
-) -> bool | None:
-    return is_apart(domain, named.get(first, first), named.get(second, second))
+def _judge_by_name(
+    judge: Callable[[str, str, str], str], domain: str, named: Mapping[str, str], first: str, second: str
+) -> str:
+    return judge(domain, named.get(first, first), named.get(second, second))
 
 
 def _of_axes(data: RunData) -> str:

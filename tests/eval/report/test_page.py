@@ -392,7 +392,8 @@ def test_the_title_says_which_plan_and_the_answer_who_leads(page: Path) -> None:
     text = page.read_text()
     assert "<h1>tiny: change detection between two LiDAR sessions of a tunnel</h1>" in text
     assert summary_of(text).count("<li>") == 0
-    answer = "Highest region recall, out of distribution: voxel-diff (1.00), not told from tunnelcd and paper (0.50)."
+    answer = "Highest region recall, out of distribution: voxel-diff (1.00), before tunnelcd and paper (0.50)"
+    answer += ", on too few pairs for a verdict."
     assert f'<p class="answer">{answer}</p>' in text
     assert "Abacus 3000" in text.partition('id="settings"')[2]
 

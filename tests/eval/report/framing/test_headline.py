@@ -61,8 +61,8 @@ def test_each_domain_has_its_leaders(tmp_path: Path) -> None:
         for world, own in shares.items() for name, value in own.items()
     ]  # fmt: skip
     assert write_answer(run(tmp_path, rows), pd.DataFrame()) == (
-        "Highest region recall, in distribution: tunnelcd (0.90), not told from c2c (0.50); "
-        "out of distribution: c2c (0.40), not told from tunnelcd (0.20)."
+        "Highest region recall, in distribution: tunnelcd (0.90), before c2c (0.50), on too few pairs for a verdict; "
+        "out of distribution: c2c (0.40), before tunnelcd (0.20), on too few pairs for a verdict."
     )
 
 
@@ -104,7 +104,8 @@ def test_leaders_are_named_without_the_settings_that_all_share(tmp_path: Path) -
     values = {"m[a.b=x]": 0.9, "n[a.b=x]": 0.5, "oracle-merge[a.b=x]": 1.0}
     rows = [{"scenario": "narrow", "variant": name, "region_recall": value} for name, value in values.items()]
     told = write_answer(run(tmp_path, rows), pd.DataFrame())
-    assert told == "Highest region recall with a.b=x, in distribution: m (0.90), not told from n (0.50)."
+    few = ", on too few pairs for a verdict"
+    assert told == f"Highest region recall with a.b=x, in distribution: m (0.90), before n (0.50){few}."
 
 
 def test_a_leader_is_before_others_only_beyond_noise(tmp_path: Path) -> None:
@@ -117,14 +118,27 @@ def test_a_leader_is_before_others_only_beyond_noise(tmp_path: Path) -> None:
 
     assert "a (0.93), before b (0.53)" in told(["narrow"])
     # six pairs of two tunnels: the families differ by what is in the air
-    assert "a (0.91), not told from b (0.51)" in told(["narrow", "dust/narrow", "dust/mist"])
+    few = "on too few pairs for a verdict"
+    assert f"a (0.91), before b (0.51), {few}" in told(["narrow", "dust/narrow", "dust/mist"])
+    assert few not in told(["narrow"])
+
+
+def test_a_leader_within_noise_is_not_told_from_the_next(tmp_path: Path) -> None:
+    rows = [
+        {"scenario": "narrow", "seed": seed, "variant": name, "region_recall": value}
+        for seed in range(8) for name, value in (("a", 0.9 if seed % 2 else 0.1), ("b", 0.1 if seed % 3 else 0.9))
+    ]  # fmt: skip
+    assert "a (0.50), not told from b (0.40)" in write_answer(run(tmp_path, rows), pd.DataFrame())
 
 
 def test_leaders_that_differ_by_a_setting_are_named_by_it(tmp_path: Path) -> None:
     values = {"m[a.b=x]": 0.9, "m[a.b=y,c.d=2]": 0.5, "oracle-merge[a.b=x]": 1.0}
     rows = [{"scenario": "narrow", "variant": name, "region_recall": value} for name, value in values.items()]
     told = write_answer(run(tmp_path, rows), pd.DataFrame())
-    assert told == "Highest region recall by a.b, in distribution: x (0.90), not told from y (0.50)."
+    assert (
+        told
+        == "Highest region recall by a.b, in distribution: x (0.90), before y (0.50), on too few pairs for a verdict."
+    )
 
 
 def test_a_plan_with_axes_says_on_how_many_its_leader_holds(tmp_path: Path) -> None:
