@@ -125,6 +125,20 @@ def clustered_interval(values: Float64Array, group: Int64Array, statistic: Stati
     return interval_of(samples)
 
 
+def interval_over_tunnels(
+    values: Float64Array, tunnels: Int64Array, statistic: Statistic = "mean", seed: int = 0
+) -> tuple[float, float]:
+    """Return the 95 % bootstrap interval of the mean or median of (N,) numbers, one for each pair, NaN left out.
+
+    Where (N,) `tunnels` says that pairs share one they are drawn together. NaN for fewer than two tunnels.
+    """
+    is_number = ~np.isnan(values)
+    values, tunnels = values[is_number], tunnels[is_number]
+    if len(np.unique(tunnels)) < len(tunnels):
+        return clustered_interval(values, tunnels, statistic)
+    return bootstrap_interval(values, statistic, seed)
+
+
 def _repeated_medians(rising: Float64Array, times: Int64Array) -> Float64Array:
     """Return (B,) medians of (N,) rising numbers, each taken (B, N) times; every row takes at least one."""
     up_to = np.cumsum(times, axis=1)
@@ -182,14 +196,12 @@ def paired_difference(
     """
     has_a, has_b = ~np.isnan(a), ~np.isnan(b)
     used = has_a & has_b
-    difference, low, high, n_used = mean_with_interval((b - a)[used], seed)
-    n_tunnels = n_used if tunnels is None else len(np.unique(tunnels[used]))
-    if tunnels is not None and n_tunnels < n_used:
-        low, high = clustered_interval((b - a)[used], tunnels[used])
+    own = (np.arange(len(a)) if tunnels is None else tunnels)[used]
+    low, high = interval_over_tunnels((b - a)[used], own, seed=seed)
     return {
-        "n_used": n_used, "n_tunnels": n_tunnels,
+        "n_used": len(own), "n_tunnels": len(np.unique(own)),
         "n_only_a": int((has_a & ~has_b).sum()), "n_only_b": int((has_b & ~has_a).sum()),
-        "mean_a": mean(a[used]), "mean_b": mean(b[used]), "difference": difference,
+        "mean_a": mean(a[used]), "mean_b": mean(b[used]), "difference": mean((b - a)[used]),
         "low": low, "high": high,
     }  # fmt: skip
 

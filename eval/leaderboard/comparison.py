@@ -13,7 +13,7 @@ import pandas as pd
 
 from eval.core.domains import domain_name
 from eval.core.output import make_writable
-from eval.core.statistics import mean, median, statistic_of
+from eval.core.statistics import interval_over_tunnels, mean, median, statistic_of
 from eval.core.terminal.printing import count_pairs
 from eval.leaderboard.evaluation import list_merges
 from eval.leaderboard.reference import take_other_methods
@@ -23,7 +23,7 @@ from eval.report.render import write_file
 from eval.running.results.run_data import RunData
 from eval.running.results.sides import find_other_worlds
 from eval.tables.conditions import odometry_of
-from eval.tables.rows import PAIR, interval_over_tunnels, is_told_the_truth, numbers, stated, tunnels_of
+from eval.tables.rows import PAIR, is_told_the_truth, numbers, stated, tunnels_of
 
 FIGURES = ("region_recall", "false_regions_per_100m", "object_iou_point", "object_f1_50", "t_total_s")
 HEADINGS = ("recall", "false/100m", "IoU", "F1 at 0.5", "time [s]")

@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.core.geometry import Float64Array, Int64Array
-from eval.core.statistics import mean, median, statistic_of
+from eval.core.statistics import interval_over_tunnels, mean, median, statistic_of
 from eval.report.comparing.columns import COMPARED, figures_of, is_time
 from eval.report.merge.tables import name_kinds
 from eval.report.pooled import POOLED, pooled_recalls
@@ -30,7 +30,6 @@ from eval.tables.rows import (
     DOMAINS,
     PAIR,
     by_domain,
-    interval_over_tunnels,
     is_told_the_truth,
     numbers,
     records,

@@ -262,9 +262,12 @@ def _remove_stale(run: RunFolder, pair: Pair, force: bool) -> None:
 
 
 def _remove_pair(run: RunFolder, pair: Pair) -> None:
-    """Remove a pair and its maps, and where it was another world every row and answer about that."""
+    """Remove a pair and its maps, and where it is of another world every row and answer about that.
+
+    A damaged pair, or one that cannot be drawn any more, may be of the same world: answers of others stay.
+    """
     held = run.pair(pair.name, pair.seed)
-    if held.exists() and not _is_simulated(held, pair):
+    if _is_of_another_world(held, pair):
         for kind in ("cells", "answers"):
             remove(run.path / kind / held.parent.name / held.name)
     remove(held)
@@ -291,12 +294,22 @@ def _settle(run: RunFolder, pairs: Sequence[Pair], keep: Keep | None, progress: 
 
 def _is_simulated(path: Path, pair: Pair) -> bool:
     """Tell whether the pair exists, is complete, and was made from this scenario and the present files."""
+    return _compare_world(path, pair) is True
+
+
+def _is_of_another_world(path: Path, pair: Pair) -> bool:
+    """Tell whether the pair exists, is complete, and was made from another scenario or from other files."""
+    return _compare_world(path, pair) is False
+
+
+def _compare_world(path: Path, pair: Pair) -> bool | None:
+    """Return whether a pair was made from its scenario and the present files; None where either cannot be told."""
     if pair.scenario is None:
-        return False
+        return None
     try:
         truth = read_pair_truth(path)
     except InputError:
-        return False
+        return None
     is_same = digest(truth.scenario) == digest(pair.scenario.model_dump(mode="json"))
     return is_same and truth.seed == pair.seed and truth.files == pair.files
 

@@ -11,7 +11,7 @@ import pandas as pd
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from eval.core.domains import domain_of
-from eval.core.statistics import Statistic, bootstrap_interval, clustered_interval, mean
+from eval.core.statistics import interval_over_tunnels, mean
 from scenarios.catalogue import clean_family
 
 PAIR = ["scenario", "seed"]
@@ -74,20 +74,6 @@ def means_with_intervals(table: pd.DataFrame, columns: Iterable[str]) -> dict[st
         found[name] = mean(values)
         found[f"{name}_low"], found[f"{name}_high"] = interval_over_tunnels(values, tunnels)
     return found
-
-
-def interval_over_tunnels(
-    values: Float64Array, tunnels: Int64Array, statistic: Statistic = "mean"
-) -> tuple[float, float]:
-    """Return the 95 % bootstrap interval of the mean or median of (N,) numbers, one for each pair, NaN left out.
-
-    Where (N,) `tunnels` says that pairs share one they are drawn together. NaN for fewer than two tunnels.
-    """
-    is_number = ~np.isnan(values)
-    values, tunnels = values[is_number], tunnels[is_number]
-    if len(np.unique(tunnels)) < len(tunnels):
-        return clustered_interval(values, tunnels, statistic)
-    return bootstrap_interval(values, statistic)
 
 
 def is_told_the_truth(variant: str) -> bool:

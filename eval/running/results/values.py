@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array
-from eval.core.statistics import mean, median, statistic_of
-from eval.tables.rows import interval_over_tunnels, tunnel_numbers
+from eval.core.statistics import interval_over_tunnels, mean, median, statistic_of
+from eval.tables.rows import tunnel_numbers
 
 Row = Mapping[str, Any]
 

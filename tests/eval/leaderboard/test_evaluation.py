@@ -296,3 +296,15 @@ def test_rows_about_another_world_go_with_its_pair(evaluator: Evaluator) -> None
     assert rows_of(evaluator, "old")["scenario"].tolist() == ["smoke/unchanged"]
     assert not evaluator.run.answer(ONE_BOX, 20000, "old").exists()
     assert len(rows_of(evaluator)) == 2
+
+
+def test_answers_of_others_outlive_a_damaged_pair_and_a_world_that_cannot_be_drawn(evaluator: Evaluator) -> None:
+    def draw(name: str, seed: int, settings: tuple[str, ...] = ()) -> Scenario:
+        raise ScenarioError(f"{name} does not fit")
+
+    evaluator.evaluate(name="old")
+    (evaluator.run.pair(ONE_BOX, 20000) / "truth" / "changes.json").write_text("{")
+    evaluator.evaluate()
+    assert len(rows_of(evaluator, "old")) == 2 == len(rows_of(evaluator))
+    evaluator.evaluate(name="new", tools=replace(TOOLS, draw=draw))
+    assert len(rows_of(evaluator, "old")) == 2 and rows_of(evaluator, "new")["status"].tolist() == ["failed"] * 2
