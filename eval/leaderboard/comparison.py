@@ -15,7 +15,7 @@ from eval.core.domains import domain_name
 from eval.core.output import make_writable
 from eval.core.statistics import interval_over_tunnels, mean, median, statistic_of
 from eval.core.terminal.printing import count_pairs
-from eval.leaderboard.evaluation import list_merges
+from eval.leaderboard.calls import list_merges
 from eval.leaderboard.reference import take_other_methods
 from eval.report.comparing.columns import COMPARED, figures_of, is_time
 from eval.report.comparing.differences import NOT_JUDGED, paired_differences, verdict

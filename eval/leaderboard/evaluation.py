@@ -1,42 +1,47 @@
 """Evaluates the command of a method on the pairs of a plan, one blind pair at a time.
 
     RUN/pairs, answers, cells, results.csv, ...         a run folder: the method is one of its variants
-    RUN/evaluations/<method>/evaluation.json            command, merge, time limit, plan; digests of the programs' files
-    RUN/evaluations/<method>/<world>/<seed>.json        how the call ended: seconds, error, end of its standard error;
-                                                        digests of the pair and of what was called
+    RUN/evaluations/<method>/evaluation.json, ...       what was called and how the calls ended (eval.leaderboard.calls)
     RUN/evaluations/<method>/table.csv, ...             the comparison (eval.leaderboard.comparison)
 
 A call that crashes, runs out of time or leaves no answer, or none that can be one, is a row with its error. It scores
 like every case without an answer. A pair is finished when its cell is of the present metrics and its call was of the
-present command, about the present simulation.
+present command, about the present simulation, and its answer is the one that the command left.
 """
 
 from __future__ import annotations
 
-import hashlib
 import random
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, Literal
-
-from pydantic import Field
 
 from cdpipe.core.errors import InputError, MergeFailedError, TunnelcdError
-from cdpipe.core.files import read_json
 from cdpipe.core.names import path_part
-from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.io.answer import write_failure
 from eval.core.output import remove
 from eval.core.provenance import digest
 from eval.core.terminal.progress import RunProgress, Silent
+from eval.leaderboard.calls import (
+    ANSWER_FILES,
+    CallFile,
+    EvaluationFile,
+    call_path,
+    digest_answer,
+    digest_method,
+    digest_pair,
+    evaluation_folder,
+    is_exchanged,
+    read_call,
+    read_call_file,
+    read_evaluation,
+)
 from eval.leaderboard.command import digest_programs, run_command
 from eval.leaderboard.given_merge import MergeMode, write_merge
 from eval.plans.plan import Plan
-from eval.plans.worlds import world_slug
 from eval.running.cell_file import LAST, NO_KEY, cell_document
 from eval.running.export import copy_pair
 from eval.running.pair_run import TOOLS, Pair, Tools, pair_lock, score_unmade
@@ -47,8 +52,6 @@ from eval.running.stages.pair_stages import PairStages
 from eval.scoring.scoring import METRICS_VERSION, CaseScore, score_stored
 from eval.truth.ground_truth import GroundTruth
 
-_ANSWER_FILES = ("answer.json", "answer.npz")
-_EXPECTED = "--force answers all pairs again"
 _MOST_ERROR = 2_000
 
 
@@ -67,35 +70,6 @@ class Method:
     command: tuple[str, ...]
     merge: MergeMode = "own"
     limit_s: float = 600.0
-
-
-class EvaluationFile(Settings):
-    """RUN/evaluations/<method>/evaluation.json; `pairs` are (scenario, seed) of the plan that was evaluated last."""
-
-    format: Literal["tunnelcd-evaluation"] = "tunnelcd-evaluation"
-    format_version: Literal[1] = 1
-    name: str
-    command: tuple[str, ...]
-    merge: MergeMode
-    limit_s: float
-    programs: Mapping[str, str]
-    plan: str
-    plan_digest: str
-    split: str = ""
-    pairs: tuple[tuple[str, int], ...]
-
-
-class CallFile(Settings):
-    """RUN/evaluations/<method>/<world>/<seed>.json.
-
-    `pair_digest` is "" where the pair cannot be made, `method_digest` (`digest_method`) where an older tunnelcd called.
-    """
-
-    method_digest: str = ""
-    pair_digest: str
-    seconds: Annotated[float, Field(ge=0)]
-    error: str
-    stderr: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,50 +133,6 @@ def evaluate_command(
     return EvaluationOutcome(len(todo), len(pairs) - len(todo), counts[0], counts[0] - counts[1])
 
 
-def evaluation_folder(run: RunFolder, name: str) -> Path:
-    """Return the folder of what is kept of a method's calls."""
-    return run.path / "evaluations" / path_part(name)
-
-
-def read_evaluation(run: RunFolder, name: str) -> EvaluationFile:
-    """Read how a method was evaluated.
-
-    Raises:
-        InputError: It was not, or the file is damaged.
-    """
-    path = evaluation_folder(run, name) / "evaluation.json"
-    return validate(EvaluationFile, Document(str(path), read_json(path, _EXPECTED)))
-
-
-def list_merges(run: RunFolder) -> dict[str, MergeMode]:
-    """Return what merge each method that was evaluated in a run was given."""
-    found = (path.parent.name for path in sorted(run.path.glob("evaluations/*/evaluation.json")))
-    return {each.name: each.merge for each in (read_evaluation(run, name) for name in found)}
-
-
-def read_call(run: RunFolder, name: str, scenario: str, seed: int) -> CallFile | None:
-    """Read how the call about a pair ended; None where there was none, or its file is damaged."""
-    return _read_call_file(_call_path(run, name, scenario, seed))
-
-
-def _read_call_file(path: Path) -> CallFile | None:
-    try:
-        return validate(CallFile, Document(str(path), read_json(path, _EXPECTED)))
-    except InputError:
-        return None
-
-
-def digest_pair(pair: Path) -> str:
-    """Return the SHA-256 of the truth of a simulated pair: another simulation has another; "" without a pair."""
-    truth = pair / "truth" / "changes.json"
-    return hashlib.sha256(truth.read_bytes()).hexdigest() if truth.is_file() else ""
-
-
-def digest_method(evaluation: EvaluationFile) -> str:
-    """Return a digest of all that makes two answers those of one method: command, programs, merge and time limit."""
-    return digest(evaluation.model_dump(mode="json", include={"command", "programs", "merge", "limit_s"}))
-
-
 def _take_over(run: RunFolder, method: Method, plan: Plan, pairs: Sequence[Pair], *, force: bool) -> EvaluationFile:
     """Write evaluation.json; refuse to mix rows of two commands under one name, or remove those of the other one."""
     document = EvaluationFile(
@@ -233,9 +163,18 @@ def _take_over(run: RunFolder, method: Method, plan: Plan, pairs: Sequence[Pair]
     if force:
         is_changed = _remove_others(run, method.name, digest_method(document))
         if is_changed:  # no table holds the rows of another method while this one answers
-            write_tables(run) if any(True for _ in run.each_cell()) else remove(run.path / "results.csv")
+            _renew_tables(run)
     write_json(path, document.model_dump(mode="json"))
     return document
+
+
+def _renew_tables(run: RunFolder) -> None:
+    """Write the tables of the cells that are left; without cells there is none."""
+    if any(True for _ in run.each_cell()):
+        write_tables(run)
+        return
+    for table in sorted(run.path.glob("*.csv")):
+        remove(table)
 
 
 def _remove_others(run: RunFolder, name: str, called: str) -> bool:
@@ -246,12 +185,12 @@ def _remove_others(run: RunFolder, name: str, called: str) -> bool:
     calls, is_changed = evaluation_folder(run, name), False
     for kind, entry in (("cells", f"{path_part(name)}.json"), ("answers", path_part(name))):
         for pair in run.path.glob(f"{kind}/*/*"):
-            call = _read_call_file(calls / pair.parent.name / f"{pair.name}.json")
+            call = read_call_file(calls / pair.parent.name / f"{pair.name}.json")
             if (call is None or call.method_digest != called) and (pair / entry).exists():
                 remove(pair / entry)
                 is_changed = True
     for path in calls.glob("*/*.json"):
-        call = _read_call_file(path)
+        call = read_call_file(path)
         if call is None or call.method_digest != called:
             remove(path)
     if is_changed:
@@ -265,12 +204,14 @@ def _is_finished(run: RunFolder, method: Method, pair: Pair, called: str) -> boo
     cell = run.read_cell(run.cell(pair.name, pair.seed, method.name))
     if call is None or cell is None or cell["row"].get("metrics_version") != METRICS_VERSION:
         return False
+    if is_exchanged(call, run.answer(pair.name, pair.seed, method.name)):
+        return False
     return call.method_digest == called and call.pair_digest == digest_pair(run.pair(pair.name, pair.seed))
 
 
 def _evaluate_pair(run: RunFolder, method: Method, pair: Pair, called: str, progress: RunProgress, tools: Tools) -> str:
     """Make a pair, answer it and write its cell; returns why there is no answer, "" where there is one."""
-    folder, path = run.answer(pair.name, pair.seed, method.name), _call_path(run, method.name, pair.name, pair.seed)
+    folder, path = run.answer(pair.name, pair.seed, method.name), call_path(run, method.name, pair.name, pair.seed)
     for stale in (run.cell(pair.name, pair.seed, method.name), path, folder):
         remove(stale)
     opened = open_pair(run, pair, progress, tools)
@@ -285,7 +226,8 @@ def _evaluate_pair(run: RunFolder, method: Method, pair: Pair, called: str, prog
         call, score = _score(method, opened[1], folder, call)
     names = {"scenario": pair.name, "seed": pair.seed, "variant": method.name, "preset": method.name}
     identity = {**names, "pair_kind": pair.kind, "commit": None, "is_contended": False}
-    write_json(path, {**call.model_dump(mode="json"), "method_digest": called})
+    digests = {"method_digest": called, "answer_digest": digest_answer(folder)}
+    write_json(path, {**call.model_dump(mode="json"), **digests})
     write_json(run.cell(pair.name, pair.seed, method.name), cell_document(score, identity, NO_KEY, LAST))
     return call.error
 
@@ -309,7 +251,7 @@ def _call(run: RunFolder, method: Method, pair: Pair, opened: tuple[PairStages, 
             write_failure(answer, method.name, "failed", error, {}, {})
         else:
             answer.mkdir(parents=True)
-            for name in _ANSWER_FILES:
+            for name in ANSWER_FILES:
                 if (places["out"] / name).is_file():
                     shutil.copyfile(places["out"] / name, answer / name)
     return CallFile(pair_digest=known, seconds=ended.seconds, error=error, stderr=ended.stderr)
@@ -341,28 +283,3 @@ def _places() -> Iterator[dict[str, Path]]:
         pair.mkdir()
         sessions = {name: pair / name for name in ("before", "after")}
         yield {**places, **sessions, "merge": Path(folder) / "merge.json"}
-
-
-def _call_path(run: RunFolder, name: str, scenario: str, seed: int) -> Path:
-    return evaluation_folder(run, name) / world_slug(scenario) / f"{seed}.json"
-
-
-def describe_calls(run: RunFolder, evaluation: EvaluationFile) -> dict[tuple[str, int], Mapping[str, Any]]:
-    """Return how the call about each pair of the evaluation ended, by (scenario, seed)."""
-    calls = {pair: read_call(run, evaluation.name, *pair) for pair in evaluation.pairs}
-    return {pair: call.model_dump(mode="json") for pair, call in calls.items() if call is not None}
-
-
-def require_an_answer(run: RunFolder, name: str) -> None:
-    """Refuse an evaluation in which the command failed on every pair; its rows and calls stay.
-
-    Raises:
-        InputError: How the first call ended, and where all of them are kept.
-    """
-    pairs = read_evaluation(run, name).pairs
-    errors = [call.error if (call := read_call(run, name, *pair)) else "" for pair in pairs]
-    if pairs and all(errors):
-        (world, seed), folder = pairs[0], evaluation_folder(run, name)
-        raise InputError(
-            f"{name}: no pair has an answer; {world} {seed}: {errors[0]}; {folder}/*/SEED.json hold what it said"
-        )

@@ -13,6 +13,7 @@ import pandas as pd
 from cdpipe.core.errors import InputError
 from eval.core.output import made_parents, require_replaceable
 from eval.core.terminal.printing import count_pairs
+from eval.leaderboard.calls import list_merges
 from eval.leaderboard.comparison import (
     FIGURES,
     HEADINGS,
@@ -25,7 +26,6 @@ from eval.leaderboard.comparison import (
     summarise_figures,
     take_figures,
 )
-from eval.leaderboard.evaluation import list_merges
 from eval.leaderboard.reference import find_reference
 from eval.leaderboard.submission import CheckedFile
 from eval.report.render import render_page, write_file

@@ -30,7 +30,7 @@ from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.io.answer_parts import MAX_ERROR
 from eval.core.output import made_parents, require_replaceable, unwritable
 from eval.core.provenance import git_commit, machine, versions
-from eval.leaderboard.evaluation import EvaluationFile, digest_method, digest_pair, read_call, read_evaluation
+from eval.leaderboard.calls import EvaluationFile, digest_method, digest_pair, is_exchanged, read_call, read_evaluation
 from eval.leaderboard.given_merge import MergeMode
 from eval.running.cell_rows import TEXT_COLUMNS
 from eval.running.predictions import is_name_of_ours
@@ -243,6 +243,8 @@ def _collect(run: RunFolder, evaluation: EvaluationFile) -> tuple[list[PairPart]
             mistakes.append(f"{scenario} {seed} (of another command)")
         elif held and held != call.pair_digest:
             mistakes.append(f"{scenario} {seed} (simulated anew since)")
+        elif is_exchanged(call, answer):
+            mistakes.append(f"{scenario} {seed} (its answer was exchanged)")
         else:
             files = {file: _describe(answer / file) for file in _FILES if (answer / file).is_file()}
             part = {"scenario": scenario, "seed": seed, "pair_digest": call.pair_digest, "seconds": call.seconds,

@@ -24,7 +24,7 @@ from cdpipe.io.readers import open_session
 from cdpipe.model.config import load_config
 from eval.cli.listing import list_entries
 from eval.core.tablefile import read_table
-from eval.leaderboard.evaluation import describe_calls, evaluation_folder, read_evaluation
+from eval.leaderboard.calls import describe_calls, evaluation_folder, read_evaluation
 from eval.leaderboard.reference import find_reference
 from eval.leaderboard.submission import pack_submission
 from eval.plans.plan import load_plan

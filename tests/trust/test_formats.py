@@ -28,7 +28,7 @@ from cdpipe.model.alignment import PathAlignment
 from cdpipe.sensor.ouster import parse_metadata
 from cdpipe.training.fit import FitConfig, fit
 from cdpipe.training.shard import FIELDS, encode_shard, read_shard
-from eval.leaderboard.evaluation import EvaluationFile
+from eval.leaderboard.calls import EvaluationFile
 from eval.leaderboard.submission import Submission
 from eval.running.runfolder import RunFolder, open_run_folder, write_json
 from eval.running.scaling.keeping import Dropped

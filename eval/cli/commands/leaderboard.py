@@ -73,8 +73,9 @@ def evaluate(
     quiet: Quiet = False,
 ) -> None:
     """Score a program of yours on the pairs of a plan, beside the reference results. Finished pairs are kept."""
+    from eval.leaderboard.calls import require_an_answer
     from eval.leaderboard.command import parse_command
-    from eval.leaderboard.evaluation import Method, evaluate_command, require_an_answer
+    from eval.leaderboard.evaluation import Method, evaluate_command
     from eval.leaderboard.reference import find_reference
     from eval.plans.changes import change_plan
     from eval.plans.plan import load_plan
@@ -101,8 +102,8 @@ def _compare(out: Path, name: str, committed: object, *, quiet: bool) -> None:
     """Write the tables that compare a method with the reference, and print the first."""
     import pandas as pd
 
+    from eval.leaderboard.calls import describe_calls, evaluation_folder, read_evaluation
     from eval.leaderboard.comparison import compare_with_reference, list_lines, write_tables_of
-    from eval.leaderboard.evaluation import describe_calls, evaluation_folder, read_evaluation
     from eval.running.results.run_data import RunData, read_run
     from eval.running.runfolder import RunFolder
 

@@ -31,7 +31,7 @@ from eval.running.scaling.merged_provenance import unite_provenance
 from eval.running.scaling.shards import number_pairs, stored_shard
 
 _ANSWER = ("answer.json", "answer.npz")
-# what two answers of one method share (`eval.leaderboard.evaluation.digest_method`), and the plan that they are of
+# what two answers of one method share (`eval.leaderboard.calls.digest_method`), and the plan that they are of
 _OF_A_METHOD = ("command", "programs", "merge", "limit_s", "plan", "plan_digest", "split")
 
 

@@ -15,7 +15,7 @@ from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.io.known_merge import read_alignment, read_known_merge, write_alignment
 from cdpipe.model.alignment import PathAlignment
 from eval.core.terminal.progress import Silent
-from eval.leaderboard.evaluation import evaluation_folder, read_call, read_evaluation, require_an_answer
+from eval.leaderboard.calls import evaluation_folder, read_call, read_evaluation, require_an_answer
 from eval.leaderboard.given_merge import write_merge
 from eval.leaderboard.submission import pack_submission
 from eval.oracles.merge import OracleMerge, align_by_truth
@@ -140,6 +140,7 @@ def test_after_an_interrupted_force_no_answer_of_the_old_command_is_kept(evaluat
     evaluator.evaluate()
     with pytest.raises(KeyboardInterrupt):
         evaluator.evaluate(LATER, force=True, progress=Interrupted())
+    assert not [*evaluator.run.path.glob("*.csv")]
     with pytest.raises(InputError, match="lacks 1 of 2 pairs"):
         pack_submission(evaluator.run, "mine", evaluator.run.path.parent / "x.zip")
     outcome = evaluator.evaluate(LATER)
@@ -162,6 +163,14 @@ def test_force_on_a_part_of_the_plan_leaves_no_row_of_the_old_command(evaluator:
     evaluator.plan = whole.model_copy(update={"scenarios": whole.scenarios[:1]})
     evaluator.evaluate(LATER, force=True)  # the same command: the other pair stays
     assert len(rows_of(evaluator)) == 2
+
+
+def test_an_answer_that_was_exchanged_is_given_again(evaluator: Evaluator) -> None:
+    evaluator.evaluate()
+    answer = evaluator.run.answer(ONE_BOX, 20000, "mine") / "answer.json"
+    answer.write_text(answer.read_text() + " ")
+    assert evaluator.evaluate().n_done == 1
+    assert evaluator.evaluate().n_done == 0
 
 
 def test_a_call_of_another_command_is_neither_kept_nor_packed(evaluator: Evaluator) -> None:

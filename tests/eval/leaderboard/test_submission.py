@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 from cdpipe.core.errors import InputError
-from eval.leaderboard.evaluation import digest_method, read_evaluation
+from eval.leaderboard.calls import digest_method, read_evaluation
 from eval.leaderboard.page import write_leaderboard
 from eval.leaderboard.submission import CheckedFile, pack_submission, read_submission, score_again
 from eval.running.runfolder import RunFolder
@@ -99,6 +99,13 @@ def test_results_of_another_simulation_are_not_packed(run: RunFolder, tmp_path: 
         pack_submission(run, "mine", tmp_path / "x.zip")
     shutil.rmtree(run.path / "pairs")  # pairs can be made again: nothing contradicts
     assert pack_submission(run, "mine", tmp_path / "x.zip") == 2
+
+
+def test_an_answer_that_was_exchanged_after_its_call_is_not_packed(run: RunFolder, tmp_path: Path) -> None:
+    answer = run.answer(ONE_BOX, 20000, "mine") / "answer.json"
+    answer.write_text(answer.read_text() + " ")
+    with pytest.raises(InputError, match=r"smoke/one_box 20000 \(its answer was exchanged\)"):
+        pack_submission(run, "mine", tmp_path / "x.zip")
 
 
 @pytest.mark.parametrize("name", ["other", "../run"])
