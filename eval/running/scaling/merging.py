@@ -88,7 +88,7 @@ def merge_runs(
         if keep == "sessions":
             _take_pairs(runs, partial, progress)
         _take_records(runs, partial)
-        _take_evaluations(runs, evaluations, partial)
+        _take_evaluations(runs, evaluations, sources, partial)
         write_tables(merged)
         write_json(partial / "provenance.json", {**provenance, "finished": now()})
     progress.cells("done", len(sources), len(sources))
@@ -265,12 +265,20 @@ def _unite_evaluations(runs: Sequence[RunFolder]) -> dict[str, dict[str, Any]]:
     return united
 
 
-def _take_evaluations(runs: Sequence[RunFolder], united: Mapping[str, Mapping[str, Any]], target: Path) -> None:
+def _take_evaluations(
+    runs: Sequence[RunFolder],
+    united: Mapping[str, Mapping[str, Any]],
+    sources: Mapping[str, RunFolder],
+    target: Path,
+) -> None:
+    """Write evaluation.json, and take the record of each call from the run that gives its cell."""
     for name, document in united.items():
         folder = target / "evaluations" / name
         for run in runs:
             for path in sorted(run.path.glob(f"evaluations/{name}/*/*.json")):
                 place = folder / path.parent.name / path.name
+                if sources.get(f"cells/{path.parent.name}/{path.stem}/{name}.json", run) is not run:
+                    continue
                 place.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(path, place)
         folder.mkdir(parents=True, exist_ok=True)

@@ -226,3 +226,18 @@ def test_what_was_evaluated_comes_along_and_two_methods_of_one_name_do_not(
     other.write_text(json.dumps({**json.loads(other.read_text()), "merge": "given"}))
     with pytest.raises(InputError, match=r"under the name mine \(merge\): evaluate one of them"):
         merge_runs(copies, tmp_path / "two", keep="answers")
+
+
+def test_the_record_of_a_call_is_of_the_run_that_gives_its_answer(tmp_path: Path, shards: Sequence[Path]) -> None:
+    copies = [shutil.copytree(shards[0], tmp_path / name) for name in ("first", "second")]
+    cell = next(copies[0].glob("cells/*/*/*.json"))
+    seed, world, method = cell.parent.name, cell.parents[1].name, cell.stem
+    for copy in copies:
+        folder = copy / "evaluations" / method
+        (folder / world).mkdir(parents=True)
+        document = {"command": ["python", "m.py"], "merge": "own", "limit_s": 60.0, "pairs": [["world", 1]]}
+        (folder / "evaluation.json").write_text(json.dumps(document))
+        (folder / world / f"{seed}.json").write_text(json.dumps({"error": copy.name}))
+    merge_runs(copies, tmp_path / "run", keep="answers")
+    call = tmp_path / "run" / "evaluations" / method / world / f"{seed}.json"
+    assert json.loads(call.read_text()) == {"error": "first"}
