@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_bytes
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import BoolArray, Float64Array
 from cdpipe.core.geometry.motion import Motion, make_motion
 
 TUM_LINE = "stamp tx ty tz qx qy qz qw"
@@ -126,6 +126,14 @@ def require_unit_poses(poses: Float64Array, where: Callable[[int], str]) -> None
         raise InputError(
             f"{where(index)}: the quaternion's length is {norms[index]:.6g}, expected 1: the order is qx qy qz qw"
         )
+
+
+def are_poses(poses: Float64Array) -> BoolArray:
+    """Tell which of (N, 7) poses x, y, z, qx, qy, qz, qw are finite with unit quaternions, as (N,)."""
+    is_near: BoolArray = np.all(np.abs(poses) < _FARTHEST_M, axis=1)  # NaN is not
+    with np.errstate(over="ignore", invalid="ignore"):
+        is_unit: BoolArray = np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1.0) < _UNIT_TOLERANCE
+    return is_near & is_unit
 
 
 def _row(where: str, line: str) -> list[float]:

@@ -33,6 +33,7 @@ _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8
 _MOST_POINTS = 10_000_000
 _MOST_POSES = 2_000_000
 _MOST_TOPICS = 10_000
+_MOST_FRAMES = 8
 _ERRORS = (
     OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, AssertionError,
     UnicodeError, EOFError,
@@ -53,15 +54,16 @@ def list_topics(path: str) -> Iterator[Message]:
 
 
 def read_stamps(path: str, topic: str) -> Iterator[Message]:
-    """Yield the stamps (S,) int64 ns of a cloud topic's headers, whether each has returns, and the first frame."""
+    """Yield the stamps (S,) int64 ns of a cloud topic's headers, whether each has returns, and their frames, sorted."""
     with _bag(path) as bag:
-        stamps, has_returns, frame = [], [], ""
+        stamps, has_returns, frames = [], [], set()
         for message, _ in _messages(bag, [topic]):
-            frame = frame or str(message.header.frame_id)
+            frames.add(str(message.header.frame_id).lstrip("/"))
             stamps.append(_nanoseconds(message.header.stamp))
             points = _cloud(message)["points"]
             has_returns.append(bool((np.isfinite(points).all(axis=1) & points.any(axis=1)).any()))
-    yield {"frame": frame}, {"stamps": np.array(stamps, np.int64), "has_returns": np.array(has_returns, np.uint8)}
+    about = {"frames": sorted(frames)[:_MOST_FRAMES]}
+    yield about, {"stamps": np.array(stamps, np.int64), "has_returns": np.array(has_returns, np.uint8)}
 
 
 def read_clouds(path: str, topic: str) -> Iterator[Message]:

@@ -11,14 +11,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError, InputWarning
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, make_pose
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, make_pose
 from cdpipe.core.isolated_reader import IsolatedReader
 from cdpipe.core.names import visible
 from cdpipe.core.plugins import require_extra
 from cdpipe.io.foreign.bag_files import CLOUD, ODOMETRY, POSE, TRANSFORMS
 from cdpipe.io.foreign.clouds import Cloud, check_cloud
 from cdpipe.io.foreign.trajectory import Trajectory
-from cdpipe.io.tum import require_unit_poses
+from cdpipe.io.tum import are_poses, require_unit_poses
 
 # Frames in which a robot keeps its way, the smooth one first; that of LOAM and its kin moves with no sensor either.
 _FIXED = ("odom", "map", "world")
@@ -38,6 +38,8 @@ class _Edge:
     poses: Float64Array
 
     def at(self, time_s: Float64Array) -> Float64Array:
+        if not self.is_moving:
+            return self.poses[:1].repeat(len(time_s), axis=0)
         motion = Trajectory("", self.poses, self.time_s).motion()
         return self.poses[:1].repeat(len(time_s), axis=0) if motion is None else motion.poses(time_s)
 
@@ -73,7 +75,7 @@ class BagScans:
             raise InputError(f"{path}: --topic {unknown[0]}: not in it: it holds {self._listed()}")
         self._topic = self._choose(CLOUD, topics, "PointCloud2")
         ((about, arrays),) = self._reader.read("read_stamps", path=self.name, topic=self._topic)
-        self._frame = str(about["frame"]).lstrip("/")
+        self._frame = self._require_one_frame([str(frame) for frame in about["frames"]])
         stamps: Int64Array = arrays["stamps"]
         if not len(stamps):
             raise InputError(f"{path}: {self._topic}: no cloud can be read from it")
@@ -173,6 +175,16 @@ class BagScans:
             warnings.warn(f"{self._path}: {told}", InputWarning, stacklevel=2)
         return has_returns
 
+    def _require_one_frame(self, frames: Sequence[str]) -> str:
+        """Return the frame of the clouds, "" where they name none; refuse those of several sensors on one topic."""
+        if len(frames) > 1:
+            told = ", ".join(visible(frame) or "no name" for frame in frames)
+            raise InputError(
+                f"{self._path}: {self._topic}: its clouds are of several frames ({told}), and so of several sensors: "
+                "record one topic for each"
+            )
+        return frames[0] if frames else ""
+
     def _leave_out(self, stamps_s: Float64Array, own: Trajectory) -> None:
         assert own.time_s is not None
         slack_s = max(float(np.median(np.diff(times))) if len(times) > 1 else 0.0 for times in (stamps_s, own.time_s))
@@ -191,7 +203,7 @@ class BagScans:
 
     def _find_poses(self, topics: Sequence[str]) -> Trajectory | None:
         """Return poses by a named topic; else by tf that moves below a fixed frame, Odometry, PoseStamped, other tf."""
-        edges = self._read_edges([name for name, kind, _ in self._topics if kind == TRANSFORMS])
+        edges = self._read_edges([name for name, kind, _ in self._topics if kind == TRANSFORMS], is_tf=True)
         named = [(name, kind) for name, kind, _ in self._topics if name in topics and kind in (ODOMETRY, POSE)]
         chain = _chain(edges, self._frame)
         is_moving = any(edge.is_moving for edge in chain)
@@ -212,31 +224,53 @@ class BagScans:
 
         Clouds in the frame that the poses lie in are registered already, as those of LOAM and its kin are.
         """
+        where = f"{topic} of {self._path}"
         for child, edge in self._read_edges([topic]).items():
             if self._frame and self._frame == edge.parent:
                 told = f"its clouds are in {visible(self._frame)}, the frame of the poses of {topic}"
                 told += ": they are taken as registered, and moved back"
                 warnings.warn(f"{self._path}: {self._topic}: {told}", InputWarning, stacklevel=2)
-                found = _compose(f"{topic} of {self._path}", [edge])
+                found = _compose(where, [edge])
                 return found and replace(found, holds_clouds=True)
-            mounting = [] if child in ("", self._frame) else _chain(edges, self._frame, child)
-            if child not in ("", self._frame) and not mounting:
-                told = (
-                    f"{topic} has the poses of {visible(child)}, and no tf tells where {visible(self._frame)} is on it"
-                )
-                warnings.warn(f"{self._path}: {told}: they are taken for the same", InputWarning, stacklevel=2)
-            return _compose(f"{topic} of {self._path}", [edge, *mounting])
+            if child == self._frame:
+                return _compose(where, [edge])
+            mounting = _mounting(edges, child, self._frame) if child else []
+            if not mounting:
+                self._warn_of_base(topic, child, edges)
+            return _compose(where, [edge, *mounting])
         return None
 
-    def _read_edges(self, topics: Sequence[str]) -> dict[str, _Edge]:
-        """Return the edge above each frame, by the frame; a frame with two parents keeps the one that moves."""
+    def _warn_of_base(self, topic: str, child: str, edges: dict[str, _Edge]) -> None:
+        """Warn that poses may be those of a base, and are taken for the sensor's."""
+        sensor = visible(self._frame)
+        if child:
+            told = f"{topic} has the poses of {visible(child)}, and no tf tells where {sensor} is on it"
+        elif self._frame in edges:
+            told = f"the poses of {topic} name no frame, and tf has {sensor} on {visible(edges[self._frame].parent)}"
+        else:
+            return
+        told += ": they are taken for those of the sensor: where they are not, give --trajectory FILE"
+        warnings.warn(f"{self._path}: {told}", InputWarning, stacklevel=2)
+
+    def _read_edges(self, topics: Sequence[str], *, is_tf: bool = False) -> dict[str, _Edge]:
+        """Return the edge above each frame, by the frame; a frame with two parents keeps the one that moves.
+
+        Of tf, transforms that are none are left out, as they may be of any part of a robot.
+        """
         edges: dict[str, _Edge] = {}
         if not topics:
             return edges
         for about, arrays in self._reader.read("read_transforms", path=self.name, topics=list(topics)):
             parent, child = str(about["parent"]), str(about["child"])
             where = f"{self._path}: {visible(child)} in {visible(parent)}"
-            edge = _make_edge(where, parent, arrays["stamps"], arrays["poses"], is_static=bool(about["is_static"]))
+            stamps, rows = arrays["stamps"], arrays["poses"]
+            if is_tf and not (is_pose := are_poses(rows)).all():
+                told = f"{np.count_nonzero(~is_pose)} of {len(rows)} transforms are no poses, and are left out"
+                warnings.warn(f"{where}: {told}", InputWarning, stacklevel=2)
+                stamps, rows = stamps[is_pose], rows[is_pose]
+                if not len(rows):
+                    continue
+            edge = _make_edge(where, parent, stamps, rows, is_static=bool(about["is_static"]))
             if child not in edges or len(edge.time_s) > len(edges[child].time_s):
                 edges[child] = edge
         return edges
@@ -266,9 +300,35 @@ def _chain(edges: dict[str, _Edge], frame: str, top: str = "") -> list[_Edge]:
     return chain[:ends][::-1]
 
 
+def _mounting(edges: dict[str, _Edge], base: str, frame: str) -> list[_Edge]:
+    """Return the edges that lead from a base to a frame of the same robot; empty where tf tells of no such way."""
+    below = _chain(edges, frame, base)
+    if below:
+        return below
+    above = [base]
+    for edge in _climb(edges, base):
+        above.append(edge.parent)
+        if above[-1] in _NO_SENSOR:
+            return []
+        if above[-1] == frame or (below := _chain(edges, frame, above[-1])):
+            up = _climb(edges, base)[: len(above) - 1]
+            return [_Edge(name, each.time_s, invert(each.poses)) for name, each in zip(above, up, strict=False)] + below
+    return []
+
+
+def _climb(edges: dict[str, _Edge], frame: str) -> list[_Edge]:
+    """Return the edges above a frame, the nearest first."""
+    found: list[_Edge] = []
+    while frame in edges and len(found) < _LONGEST_CHAIN:
+        found.append(edges[frame])
+        frame = found[-1].parent
+    return found
+
+
 def _compose(where: str, chain: Sequence[_Edge]) -> Trajectory | None:
     """Return the poses along a chain of edges, at the times of that with the most; None if they share no time."""
-    moving = [edge.time_s for edge in chain if len(edge.time_s) > 1] or [chain[0].time_s]
+    moving = [edge.time_s for edge in chain if edge.is_moving]
+    moving = moving or [edge.time_s for edge in chain if len(edge.time_s) > 1] or [chain[0].time_s]
     start_s, end_s = max(times[0] for times in moving), min(times[-1] for times in moving)
     time_s = max(moving, key=len)
     time_s = time_s[(time_s >= start_s) & (time_s <= end_s)]

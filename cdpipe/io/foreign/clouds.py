@@ -19,6 +19,7 @@ from cdpipe.io.foreign.trajectory import Trajectory
 SWEEP_S = (0.004, 1.5)
 TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "timeoffset", "point_time", "gps_time")
 """Names, in lower case, under which formats keep the time of each point."""
+_FIRST_S = 1e8  # of 1973: file names with fewer seconds are counters
 INTENSITY_FIELDS = ("intensity", "reflectivity", "remission", "scalar_intensity", "i")
 """Names, in lower case, under which formats keep how strongly each point shone, the usual one first."""
 
@@ -152,6 +153,8 @@ def stamps_of_names(files: list[Path]) -> Float64Array | None:
         stem = file.name.removesuffix(file.suffix)
         if match := re.search(r"(?<!\d)(\d{9,10})[._](\d{1,9})(?!\d)", stem):
             whole, rest = match.groups()
+            if int(whole) < _FIRST_S:  # a counter
+                return None
             # after an underscore nanoseconds, which may lack their leading zeros
             share = int(rest) / 1e9 if "_" in match.group() else float(f"0.{rest}")
             stamps.append(int(whole) + share)

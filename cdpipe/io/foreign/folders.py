@@ -43,6 +43,10 @@ def open_folder(folder: Path, name: str, has_poses: bool) -> Clouds:
     if not files:
         raise InputError(f"{folder}: no scans of the format {name} in it")
     _require_padded(folder, files)
+    if has_poses and name == "kitti" and (folder / _CALIBRATION).is_file():
+        told = "is not applied to a trajectory from elsewhere, which is taken for that of the lidar"
+        told += f": KITTI's poses of the camera belong beside it, as {folder / 'poses.txt'}"
+        warnings.warn(f"{folder / _CALIBRATION}: {told}", InputWarning, stacklevel=2)
     own = None if has_poses else _find_poses(folder, files[0].parent, name)
     clouds = CloudFiles(folder, files, cloud_reader(name, folder), own, _find_stamps(folder, files))
     clouds.lacks = f"expected exactly one trajectory (*.txt, *.tum or *.csv, lines {TUM_LINE}), found none"

@@ -25,6 +25,7 @@ _LIBRARY_MODULES = ("laspy", "lazrs", "pye57", "pyo3_runtime")
 MOST_POINTS = 20_000_000
 _BLOCK = 1_000_000
 _KITTI = np.dtype("<f4")
+_MOST_NEGATIVE = 0.02  # share of intensities below 0 in scans of a layout that is read
 # What the libraries raise for a faulty file.
 _ERRORS = (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, AssertionError)
 
@@ -62,20 +63,35 @@ def read_ply_cloud(path: Path) -> Cloud:
 
 
 def read_bin(path: Path) -> Cloud:
-    """Read x, y, z and intensity as little-endian float32, as KITTI and SemanticKITTI store scans.
+    """Read x, y, z, intensity as little-endian float32, as KITTI stores scans, or with a ring behind, as nuScenes does.
 
     Raises:
-        InputError: The file is missing, or its size is not that of whole points.
+        InputError: The file is missing, its size is not that of whole points, or it is of another layout.
     """
-    content = read_bytes(path, MOST_POINTS * 16)
-    if not content or len(content) % 16:
+    content = read_bytes(path, MOST_POINTS * 20)
+    n_columns = 5 if _has_rings(content) else 4
+    if not content or len(content) % (4 * n_columns):
         raise InputError(
             f"{path}: {len(content)} bytes: expected x, y, z, intensity as float32, 16 bytes a point: cut short, or of "
             "another layout"
         )
     with np.errstate(invalid="ignore"):
-        rows = np.frombuffer(content, _KITTI).reshape(-1, 4)
+        rows = np.frombuffer(content, _KITTI).reshape(-1, n_columns)
+        if (rows[:, 3] < 0).mean() > _MOST_NEGATIVE:
+            raise InputError(
+                f"{path}: {(rows[:, 3] < 0).mean():.0%} of its intensities are negative: expected x, y, z, intensity "
+                "as float32, 16 bytes a point, or 20 with a ring: it is of another layout"
+            )
         return Cloud(rows[:, :3].astype(np.float64), intensity=rows[:, 3].astype(np.float32))
+
+
+def _has_rings(content: bytes) -> bool:
+    """Tell whether a fifth number of every point is that of a ring: 0 to 255, whole, not always the same."""
+    if not content or len(content) % 20:
+        return False
+    with np.errstate(invalid="ignore"):
+        rings = np.frombuffer(content, _KITTI).reshape(-1, 5)[:, 4]
+        return bool(((rings >= 0) & (rings < 256) & (rings == np.floor(rings))).all() and np.ptp(rings) > 0)
 
 
 def read_viewpoints(folder: Path, files: list[Path]) -> np.ndarray[Any, Any]:

@@ -41,7 +41,7 @@ FORMATS = {
     "ply": Format("PLY scans", (".ply",), ((0, b"ply\n"), (0, b"ply\r")), in_folders=True),
     "pcd": Format("PCD scans", (".pcd",), ((0, b"# .PCD"), (0, b"VERSION"), (0, b"#.PCD")), in_folders=True),
     "las": Format("LAS, LAZ or COPC scans", (".las", ".laz"), ((0, b"LASF"),), in_folders=True),
-    "kitti": Format("KITTI .bin scans (float32 x, y, z, intensity)", (".bin",), in_folders=True),
+    "kitti": Format("KITTI or nuScenes .bin scans (float32 x, y, z, intensity)", (".bin",), in_folders=True),
     "e57": Format("E57", (".e57",), ((0, b"ASTM-E57"),)),
     "bag": Format(
         "a ROS 1 bag, ROS 2 bag or MCAP",
@@ -106,8 +106,10 @@ def _formats_in(folder: Path) -> dict[str, int]:
     if (folder / "session.json").is_file():
         return {"session": 1}
     counts = {name: len(find_scans(folder, name)) for name, each in FORMATS.items() if each.in_folders}
-    bags = _files(folder, FORMATS["bag"].suffixes)
-    counts["bag"] = min(len(bags), 1) if (folder / "metadata.yaml").is_file() else len(bags)
+    if (folder / "metadata.yaml").is_file():  # its files may be compressed: x.db3.zstd
+        counts["bag"] = int(any({".db3", ".mcap"} & set(file.suffixes) for file in folder.iterdir()))
+    else:
+        counts["bag"] = len(_files(folder, FORMATS["bag"].suffixes))
     found = {name: count for name, count in counts.items() if count}
     # one map beside scans or a bag is no scan
     return {name: count for name, count in found.items() if count > 1 or name == "bag"} or found

@@ -15,6 +15,7 @@ from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.files import read_bytes
 from cdpipe.core.geometry import BoolArray, Float64Array, make_pose, travelled_m
 from cdpipe.core.geometry.motion import Motion, make_motion
+from cdpipe.io.foreign.columns import TIME_UNITS_S, find_columns, find_rivals, is_header
 from cdpipe.io.tum import MOST_BYTES, TUM_LINE, read_tum, require_unit_poses
 
 # A pose is rigid if no entry of R R^T is farther than this from the identity; KITTI files have six digits.
@@ -24,22 +25,7 @@ _NOMINAL_S = 0.1  # between scans, where there is one scan only
 # Poses farther apart than this say nothing about the scans between them, unless scans are as rare.
 _LONGEST_GAP_S = 1.0
 _SECONDS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # from this median on, stamps are ns, us, ms
-# What may end the name of a CSV's column, `yaw_deg` or `time [ms]`: units of angles, and of times but for seconds.
-_ANGLE_UNITS = ("deg", "degrees", "rad", "radians")
-_TIME_UNITS_S = {"ms": 1e-3, "msec": 1e-3, "us": 1e-6, "usec": 1e-6, "ns": 1e-9, "nsec": 1e-9}
-_NAMES = {
-    "time": ("t", "time", "stamp", "timestamp", "s"),
-    "sec": ("sec", "secs", "seconds"), "nsec": ("nsec", "nsecs", "nanosec", "nanosecs", "nanoseconds", "ns"),
-    "x": ("x", "tx", "px"), "y": ("y", "ty", "py"), "z": ("z", "tz", "pz"),
-    "qx": ("qx",), "qy": ("qy",), "qz": ("qz",), "qw": ("qw",),
-    "roll": ("roll",), "pitch": ("pitch",), "yaw": ("yaw", "heading"),
-}  # fmt: skip
-_TURNS = {"q", "quat", "quaternion", "orientation", "rotation", "rot"}
-# Words of columns that are no pose: rates, errors and counters.
-_NO_POSE = {
-    "linear", "angular", "twist", "vel", "velocity", "acc", "accel", "acceleration", "omega", "gyro", "v", "std",
-    "stddev", "sigma", "bias", "b", "cov", "covariance", "seq",
-}  # fmt: skip
+_DATE = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?")
 _RADIANS = np.pi + 1e-3  # rounded to three digits; angles up to here are taken for radians without a unit
 _DEGREES = 7.0  # from here on they are degrees
 
@@ -109,12 +95,15 @@ def read_poses(path: Path) -> Trajectory:
 
 
 def read_times(path: Path) -> Float64Array:
-    """Read one time a line, as KITTI's times.txt has them, in seconds.
+    """Read one time a line, as KITTI's times.txt has them, or one date and time, in seconds.
 
     Raises:
         InputError: A line is not one finite number, or a time does not come after the one before it.
     """
     lines = _lines(path)
+    if all(_DATE.fullmatch(line) for _, line in lines):
+        dates = np.array([line.replace(" ", "T") for _, line in lines], "datetime64[ns]")
+        return _rising(path, dates.astype(np.int64) / 1e9)
     return _rising(path, _seconds(_numbers(path, lines, 1)[0][:, 0]))
 
 
@@ -186,14 +175,13 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read as text: {error}") from error
     lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), start=1) if line.strip()]
-    # the header of a CSV may begin as a comment does
-    first = next((index for index, (_, line) in enumerate(lines) if "," in line and _is_header(line)), None)
-    header = [lines[first]] if first is not None and all(line.startswith("#") for _, line in lines[:first]) else []
+    # a header may begin as a comment does
+    n_comments = next((index for index, (_, line) in enumerate(lines) if not line.startswith("#")), len(lines))
+    n_fields = len(_split(lines[n_comments][1])) if n_comments < len(lines) else 0
+    header = [
+        each for each in lines[: n_comments + 1] if is_header(_split(each[1]), n_fields, has_commas="," in each[1])
+    ][:1]
     return header + [each for each in lines if not each[1].startswith("#") and each not in header]
-
-
-def _is_header(line: str) -> bool:
-    return {"x", "y", "z"} <= set(_columns(_split(line)))
 
 
 def _split(line: str) -> list[str]:
@@ -212,31 +200,10 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _columns(names: Sequence[str]) -> dict[str, int]:
-    """Return the column of each quantity that a CSV's header names; a bare name first, then the first that fits."""
-    found: dict[str, int] = {}
-    bare: dict[str, int] = {}
-    for index, name in enumerate(names):
-        text = re.sub(r"[\[(].*?[\])]", "", name).strip().lower()
-        tokens = [token for token in re.split(r"[^a-z0-9]+", text) if token]
-        is_unit = len(tokens) > 1 and tokens[-1] in (*_ANGLE_UNITS, *_TIME_UNITS_S)
-        tokens = tokens[:-1] if is_unit and tokens[-1] not in _NAMES["nsec"] else tokens
-        if not tokens:
-            continue
-        # `pose.orientation.x`, `q_RS_x`: the last word is the axis, a word before says of what
-        is_turn = bool(_TURNS & set(tokens[:-1])) and tokens[-1] in ("x", "y", "z", "w")
-        last = f"q{tokens[-1]}" if is_turn else tokens[-1]
-        quantity = next((quantity for quantity, usual in _NAMES.items() if last in usual), None)
-        if quantity is None or _NO_POSE & set(tokens[:-1]):
-            continue
-        if len(tokens) == 1 and quantity not in ("time", "sec", "nsec"):  # `x` comes before `marker_x`
-            bare.setdefault(quantity, index)
-        found.setdefault(quantity, index)
-    return found | bare
-
-
 def _read_csv(path: Path, names: list[str], lines: list[tuple[int, str]]) -> Trajectory:
-    columns = _columns(names)
+    columns = find_columns(names)
+    if rivals := find_rivals(names):
+        raise InputError(f"{path}: positions may be those of {' or '.join(rivals)}: leave the other columns out")
     turns = [name for name in ("qx", "qy", "qz", "qw") if name in columns]
     angles = [name for name in ("roll", "pitch", "yaw") if name in columns]
     if not {"x", "y", "z"} <= set(columns) or (len(turns) < 4 and len(angles) < 3):
@@ -270,8 +237,8 @@ def _add_clocks(stamps: Float64Array, names: Sequence[str]) -> Float64Array:
     """Return the times (N,), seconds, of columns (N, 1), or (N, 2) of seconds and the nanoseconds beyond them."""
     last = stamps[:, -1]
     unit = re.findall(r"[a-z]+", names[0].lower())[-1]
-    if len(names) == 1 and unit in _TIME_UNITS_S:
-        return last * _TIME_UNITS_S[unit]
+    if len(names) == 1 and unit in TIME_UNITS_S:
+        return last * TIME_UNITS_S[unit]
     is_rest = stamps.shape[1] == 2 and bool((np.abs(last) < 1e9).all())
     return stamps[:, 0] + 1e-9 * last if is_rest else _seconds(last)  # nanoseconds from 1e9 on are whole stamps
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,13 +17,15 @@ from cdpipe.io.ply import write_ply_points
 _SCALE_M = 1e-4
 _STANDARD = {"intensity": "intensity", "time": "gps_time"}
 _MOST_NAME = 32
+_LARGEST = 65535
 _NO_DATE = date(1970, 1, 1)  # the day of writing would make equal maps differ
 
 
 def write_laz(path: Path, cloud: PointMap) -> None:
     """Write a map as LAS 1.4, compressed where the name ends in .laz, coordinates rounded to 0.1 mm.
 
-    `intensity` and `time` become fields of the format (uint16 and `gps_time`), all others extra dimensions.
+    `intensity` and `time` become fields of the format (uint16 and `gps_time`), all others extra dimensions. Intensities
+    of 0 to 1 are scaled to the 16 bits, others rounded.
 
     Raises:
         InputError: The extra `formats` is not installed.
@@ -40,10 +43,16 @@ def write_laz(path: Path, cloud: PointMap) -> None:
     data = laspy.LasData(header)
     data.x, data.y, data.z = cloud.points.T
     for name, values in cloud.scalars.items():
-        is_whole = name == "intensity"
-        data[_STANDARD.get(name, name[:_MOST_NAME])] = np.clip(np.nan_to_num(values), 0, 65535) if is_whole else values
+        data[_STANDARD.get(name, name[:_MOST_NAME])] = _as_16_bits(values) if name == "intensity" else values
     with path.open("wb") as file:
         data.write(file, do_compress=path.suffix.lower() == ".laz")
+
+
+def _as_16_bits(intensities: np.ndarray[Any, Any]) -> np.ndarray[Any, np.dtype[np.uint16]]:
+    values = np.nan_to_num(intensities.astype(np.float64))
+    is_share = bool(len(values)) and values.max() <= 1.0 and bool((values != np.round(values)).any())
+    whole = np.round(values * (_LARGEST if is_share else 1.0))
+    return np.asarray(np.clip(whole, 0, _LARGEST), np.uint16)
 
 
 def write_ply(path: Path, cloud: PointMap) -> None:

@@ -8,12 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import Float64Array, invert, make_pose, yaw_pose
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, invert, make_pose, transform, yaw_pose
+from cdpipe.io.foreign import HowToRead
+from cdpipe.io.readers import open_session
 
 START_NS = 1_700_000_000_000_000_000
 BASE_HZ = 50.0
+IMU_POSE = make_pose(np.eye(3), (0.006, -0.012, 0.008))
 BASE_T_SENSOR = make_pose(Rotation.from_euler("xyz", (0.0, 5.0, 90.0), degrees=True).as_matrix(), (0.3, 0.1, 0.8))
 
 
@@ -201,7 +206,7 @@ class RosMessages:
         )
         return self.types["tf2_msgs/msg/TFMessage"](transforms=[stamped])
 
-    def odometry(self, time_s: float, pose: Float64Array) -> Any:
+    def odometry(self, time_s: float, pose: Float64Array, child: str = "base_link") -> Any:
         at, turn = self._parts(pose)
         here = self.types["geometry_msgs/msg/Pose"](
             position=self.types["geometry_msgs/msg/Point"](*at), orientation=turn
@@ -209,7 +214,7 @@ class RosMessages:
         zero = self.types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
         twist = self.types["geometry_msgs/msg/Twist"](linear=zero, angular=zero)
         return self.types["nav_msgs/msg/Odometry"](
-            header=self._header(time_s, "odom"), child_frame_id="base_link",
+            header=self._header(time_s, "odom"), child_frame_id=child,
             pose=self.types["geometry_msgs/msg/PoseWithCovariance"](pose=here, covariance=np.zeros(36)),
             twist=self.types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
         )  # fmt: skip
@@ -226,20 +231,43 @@ class RosMessages:
 
         With "footprint" there is odometry, and tf moves between two frames of the robot; with "standing" tf repeats
         that the robot stands in the map; with "registered" the clouds lie in the frame of the odometry. "mounting" has
-        no poses, and tf that repeats where the sensor is on the robot.
+        no poses, and tf that repeats where the sensor is on the robot. "imu" has odometry of a part beside the sensor,
+        "unnamed" poses of the robot that name no frame, "twice" tf that tells the mounting at two times, "wheel" that
+        and a part that turns by no rotation, "frames" clouds that say they are of two sensors.
         """
         made = [
             (topic, "sensor_msgs/msg/PointCloud2", time_s, cloud)
             for topic in cloud_topics
             for time_s, cloud in self.clouds("odom" if poses == "registered" else "os_lidar")
         ]
+        for *_, cloud in made[1::2] if poses == "frames" else ():
+            cloud.header.frame_id = "rear"
         times = np.arange(self._made.stamps_s[0] - 0.1, min(self._made.stamps_s[-1] + 0.25, last_pose_s), 1 / BASE_HZ)
         base = odom_T_sensor(times) @ invert(BASE_T_SENSOR)
         tf, first = "tf2_msgs/msg/TFMessage", float(times[0])
         if poses in ("tf", "odometry", "footprint", "standing"):
             made.append(("/tf_static", tf, first, self.transform(first, "base_link", "os_lidar", BASE_T_SENSOR)))
-        for time_s, pose in zip(times.tolist(), base, strict=True):
-            if poses == "tf":
+        if poses == "imu":
+            turned = yaw_pose(np.pi, (0.0, 0.0, 0.04))
+            made.append(("/tf_static", tf, first, self.transform(first, "os_sensor", "os_lidar", turned)))
+            made.append(("/tf_static", tf, first, self.transform(first, "os_sensor", "os_imu", IMU_POSE)))
+        if poses == "unnamed":
+            made.append(("/tf_static", tf, first, self.transform(first, "base_link", "os_lidar", BASE_T_SENSOR)))
+        for number, (time_s, pose) in enumerate(zip(times.tolist(), base, strict=True)):
+            if poses in ("twice", "wheel"):
+                made.append(("/tf", tf, time_s, self.transform(time_s, "odom", "base_link", pose)))
+                if number in (10, 12):
+                    made.append(("/tf", tf, time_s, self.transform(time_s, "base_link", "os_lidar", BASE_T_SENSOR)))
+                if poses == "wheel" and number == 5:
+                    wheel = self.transform(time_s, "base_link", "wheel", np.eye(4))
+                    wheel.transforms[0].transform.rotation.w = 0.0
+                    made.append(("/tf", tf, time_s, wheel))
+            elif poses == "imu":
+                at = pose @ BASE_T_SENSOR @ invert(yaw_pose(np.pi, (0.0, 0.0, 0.04))) @ IMU_POSE
+                made.append(("/odom", "nav_msgs/msg/Odometry", time_s, self.odometry(time_s, at, "os_imu")))
+            elif poses == "unnamed":
+                made.append(("/slam/pose", "geometry_msgs/msg/PoseStamped", time_s, self.pose(time_s, pose)))
+            elif poses == "tf":
                 made.append(("/tf", tf, time_s, self.transform(time_s, "odom", "base_link", pose)))
                 made.append(
                     ("/tf", tf, time_s, self.transform(time_s, "map", "odom", yaw_pose(0.3, (5.0, time_s, 0.0))))
@@ -306,3 +334,22 @@ def _write_mcap(
             writer.add_message(channels[topic], ns, bytes(messages.store.serialize_cdr(message, kind)), ns)
         writer.finish()
     return path
+
+
+MADE, STANDING = drive(), drive(sweep_s=0.0)
+
+
+def worst_m(path: Path, how: HowToRead | None = None) -> float:
+    """Return the largest distance of a return from the walls."""
+    source = open_session(path, how)
+    scans = list(source.scans())
+    assert len(scans) == len(MADE.stamps_s) == len(source.odom_T_sensor)
+    np.testing.assert_allclose(source.odom_T_sensor, odom_T_sensor(MADE.stamps_s), atol=1e-4)
+    return max(float(off_walls_m(transform(scan.odom_T_sensor, scan.points_sensor)).max()) for scan in scans)
+
+
+def said(path: Path, how: HowToRead | None = None) -> str:
+    with pytest.raises(InputError) as caught:
+        list(open_session(path, how).scans())
+    assert "\n" not in str(caught.value)
+    return str(caught.value)

@@ -15,6 +15,8 @@ import yaml
 from cdpipe.core.geometry import Float64Array, invert, transform
 from cdpipe.io.answer import write_answer
 from cdpipe.io.foreign import read_poses
+from cdpipe.io.out.clouds import write_laz
+from cdpipe.io.out.maps import PointMap
 from cdpipe.io.ply import read_ply, write_ply_points
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import Session, read_session
@@ -209,6 +211,16 @@ def test_a_map_with_scalar_fields(pair: Path, tmp_path: Path, command: Command) 
         np.testing.assert_allclose(cloud.gps_time - cloud.gps_time.min(), scalars["time"], atol=1e-4)
     convert(command, pair / "after", tmp_path / "bare.laz", "--cell", "0.2")
     assert "change" not in set(laspy.read(tmp_path / "bare.laz").point_format.dimension_names)
+
+
+def test_intensities_of_a_laz_are_whole_and_shares_fill_16_bits(tmp_path: Path) -> None:
+    laspy = pytest.importorskip("laspy", reason="pip install 'tunnelcd[formats]'")
+    for values, expected in (
+        ([0.0, 0.5, 0.99, 1.0], [0, 32768, 64880, 65535]),
+        ([0.0, 1.0, 7.6, 9e9], [0, 1, 8, 65535]),
+    ):
+        write_laz(tmp_path / "a.laz", PointMap(np.zeros((4, 3)), {"intensity": np.array(values, np.float32)}))
+        assert laspy.read(tmp_path / "a.laz").intensity.tolist() == expected
 
 
 def made_answer(pair: Path, folder: Path) -> ChangeReport:

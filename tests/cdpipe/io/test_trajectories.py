@@ -1,0 +1,189 @@
+"""Trajectories of others: TUM, KITTI and CSV, units, orders and columns, and what is none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("pypcd4", reason="pip install 'tunnelcd[formats]'")
+pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
+
+from cdpipe.core.errors import InputError, InputWarning
+from cdpipe.io.foreign import HowToRead, read_poses
+from cdpipe.io.readers import open_session
+from tests.cdpipe.io.foreign_files import (
+    MADE,
+    START_NS,
+    drive,
+    odom_T_sensor,
+    said,
+    worst_m,
+    write_pcds,
+    write_trajectory,
+)
+
+FINE_S = np.arange(0.3, 1.4, 0.013)
+
+
+def test_a_trajectory_at_another_rate_is_interpolated(tmp_path: Path) -> None:
+    folder = write_pcds(tmp_path / "run", MADE)
+    np.savetxt(folder / "times.txt", START_NS / 1e9 + MADE.stamps_s, fmt="%.6f")
+    for kind in ("tum", "csv"):
+        assert worst_m(folder, HowToRead(trajectory=write_trajectory(tmp_path / f"t.{kind}", FINE_S, kind))) < 1e-3
+    short = write_trajectory(tmp_path / "short.tum", FINE_S[FINE_S < 0.75])
+    assert "2 scans lie up to 0.258 s outside, more than one period (0.100 s)" in said(
+        folder, HowToRead(trajectory=short)
+    )
+    other = write_trajectory(tmp_path / "other.tum", FINE_S + 100.0)
+    other.write_text("".join(f"{float(line.split()[0]) + 500:.6f} {line.split(maxsplit=1)[1]}\n"
+                             for line in other.read_text().splitlines()))  # fmt: skip
+    assert "the clocks differ by 599.8" in said(folder, HowToRead(trajectory=other))
+    (folder / "times.txt").unlink()
+    assert "the scans have none (add times.txt" in said(folder, HowToRead(trajectory=tmp_path / "t.tum"))
+    kitti = write_trajectory(tmp_path / "k.txt", MADE.stamps_s, "kitti")
+    with pytest.warns(InputWarning, match="6 of 6 scans are not deskewed, .*: there are no two poses with times"):
+        assert worst_m(folder, HowToRead(trajectory=kitti)) > 0.3
+    assert worst_m(folder, HowToRead(trajectory=kitti, deskew=False)) > 0.3
+
+
+def test_an_origin_is_subtracted_from_poses_alone(tmp_path: Path) -> None:
+    folder = write_pcds(tmp_path / "run", MADE, "binary")
+    far_m = np.array([432_000.0, 5_411_000.0, 300.0])
+    poses = odom_T_sensor(MADE.stamps_s)
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    stamps = START_NS / 1e9 + MADE.stamps_s
+    np.savetxt(tmp_path / "t.tum", np.column_stack([stamps, poses[:, :3, 3] + far_m, turns]), fmt="%.9f")
+    assert worst_m(folder, HowToRead(trajectory=tmp_path / "t.tum", origin_m=(432_000.0, 5_411_000.0, 300.0))) < 0.01
+
+
+def test_quaternions_with_w_first_are_noticed(tmp_path: Path) -> None:
+    dense = drive(n_points=40_000, sweep_s=0.0)
+    folder = write_pcds(tmp_path / "run", dense, with_time=False)
+    write_trajectory(folder / "t.tum", dense.stamps_s, order="wxyz")
+    assert "they look like qw first" in said(folder)
+    write_trajectory(folder / "t.tum", dense.stamps_s)
+    assert worst_m(folder) < 1e-4
+
+
+def test_times_of_a_trajectory_and_of_its_scans_agree(tmp_path: Path) -> None:
+    folder = write_pcds(tmp_path / "run", MADE)
+    write_trajectory(folder / "t.tum", MADE.stamps_s)
+    np.savetxt(folder / "times.txt", START_NS / 1e9 + MADE.stamps_s - 0.09, fmt="%.6f")
+    assert len(list(open_session(folder).scans())) == 6
+    np.savetxt(folder / "times.txt", START_NS / 1e9 + MADE.stamps_s - 50.0, fmt="%.6f")
+    assert "t.tum: its times and those of the scans of" in said(folder)
+    assert "differ by 50.000 s" in said(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("1 2 3\n", "3 fields: expected eight numbers"),
+        ("a,b,c\n1,2,3\n", "its header names a, b, c"),
+        ("x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,2\n", "the quaternion's length is 2"),
+        ("1 0 0 0 0 1 0 0 0 0 2 0\n", "t.txt:1: the first three columns of its 3x4 matrix are no rotation"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0\n", "t.txt:2: 3 fields, 12 in the first line"),
+        ("", "no poses in it"),
+        ("x,y,z,roll,pitch,yaw\n1,2,3,0,0,0.1\n1,,3,0,0,0.1\n", "t.txt:3: a number is missing or not finite"),
+        ("x,y,z,roll,pitch,yaw\n1,2,3,0,0,5\n", "in the header, as roll_deg,pitch_deg,yaw_deg"),
+        ("time,x,y,z,qx,qy,qz,qw\n1,2,3,4,0,0,0,1\n,2,3,4,0,0,0,1\n", "t.txt:3: a number is missing or not finite"),
+        ("time,x,y,z,qx,qy,qz,qw\ninf,2,3,4,0,0,0,1\n", "t.txt:2: a number is missing or not finite"),
+        ("time,x,y,z,qx,qy,qz,qw\n5,2,3,4,0,0,0,1\n5,2,3,4,0,0,0,1\n", "time 2 does not come after the last"),
+        ("x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,a\n", "t.txt:2: expected numbers"),
+    ],
+)
+def test_wrong_trajectories_are_named(tmp_path: Path, text: str, expected: str) -> None:
+    (tmp_path / "t.txt").write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_poses(tmp_path / "t.txt")
+    assert expected in str(caught.value)
+
+
+def test_columns_of_a_csv_are_found_by_their_names(tmp_path: Path) -> None:
+    turned = odom_T_sensor(np.array([1.0]))[0]
+    header = "seq,stamp_ns,pose.position.x,pose.position.y,pose.position.z,yaw [deg],pitch,roll,twist.linear.x"
+    yaw, pitch, roll = np.degrees([0.5, 0.05 * np.sin(1.0), 0.0])
+    at = ",".join(map(str, turned[:3, 3]))
+    (tmp_path / "t.csv").write_text(f"{header}\n7,1700000000500000000,{at},{yaw},{pitch},{roll},9\n")
+    found = read_poses(tmp_path / "t.csv")
+    np.testing.assert_allclose(found.poses[0], turned, atol=1e-9)
+    assert found.time_s is not None
+    assert found.time_s[0] == pytest.approx(1_700_000_000.5)
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["vel_x,vel_y,vel_z,{}", "a_x,a_y,a_z,{}", "linear_velocity.x,acc_y,sigma_z,{}", "std_x,omega_y,bias_z,{}"],
+)
+def test_velocities_of_a_csv_are_no_positions(tmp_path: Path, header: str) -> None:
+    (tmp_path / "t.csv").write_text(f"time,{header.format('x,y,z,qx,qy,qz,qw')}\n1,7,8,9,1,2,3,0,0,0,1\n")
+    np.testing.assert_array_equal(read_poses(tmp_path / "t.csv").poses[0, :3, 3], [1, 2, 3])
+
+
+@pytest.mark.parametrize("names", ["euler_{}", "imu_{}", "magnetic_field_{}", "target_{}"])
+def test_positions_of_a_csv_come_before_three_numbers_of_something_else(tmp_path: Path, names: str) -> None:
+    other = ",".join(names.format(axis) for axis in "xyz")
+    header = f"time,{other},position_x,position_y,position_z,q_x,q_y,q_z,q_w"
+    (tmp_path / "t.csv").write_text(f"{header}\n1,7,8,9,1,2,3,0,0,0,1\n")
+    np.testing.assert_array_equal(read_poses(tmp_path / "t.csv").poses[0, :3, 3], [1, 2, 3])
+
+
+def test_two_positions_in_a_csv_are_refused(tmp_path: Path) -> None:
+    header = "time,gps_x,gps_y,gps_z,lidar_x,lidar_y,lidar_z,qx,qy,qz,qw"
+    (tmp_path / "t.csv").write_text(f"{header}\n1,7,8,9,1,2,3,0,0,0,1\n")
+    with pytest.raises(InputError, match="positions may be those of gps or lidar: leave the other columns out"):
+        read_poses(tmp_path / "t.csv")
+
+
+@pytest.mark.parametrize(
+    ("names", "stamp"),
+    [("%time,field.header.stamp", "1700000000580000000,1700000000500000000"),
+     ("Time,header.stamp.secs,header.stamp.nsecs", "1700000000.58,1700000000,500000000")],
+)  # fmt: skip
+def test_the_stamp_of_a_header_comes_before_the_time_of_recording(tmp_path: Path, names: str, stamp: str) -> None:
+    (tmp_path / "t.csv").write_text(f"{names},x,y,z,qx,qy,qz,qw\n{stamp},1,2,3,0,0,0,1\n")
+    np.testing.assert_allclose(read_poses(tmp_path / "t.csv").time_s, [1_700_000_000.5])
+
+
+def test_a_commented_header_without_commas_tells_the_order(tmp_path: Path) -> None:
+    (tmp_path / "t.txt").write_text("# from SLAM\n# timestamp tx ty tz qw qx qy qz\n1 1 2 3 0.6 0 0 0.8\n")
+    (pose,) = read_poses(tmp_path / "t.txt").poses
+    np.testing.assert_allclose(pose[:3, 0], [0.6**2 - 0.8**2, 2 * 0.6 * 0.8, 0.0], atol=1e-12)
+    (tmp_path / "t.txt").write_text("# timestamp tx ty tz qx qy qz qw\n1 1 2 3 0 0 0.8 0.6\n")
+    found = read_poses(tmp_path / "t.txt")
+    assert found.is_tum
+    np.testing.assert_allclose(found.poses[0], pose, atol=1e-12)
+
+
+@pytest.mark.parametrize("names", ["secs,nsecs", "header.stamp.sec,header.stamp.nanosec"])
+def test_seconds_and_nanoseconds_are_added_and_words_are_passed_over(tmp_path: Path, names: str) -> None:
+    rows = "7,250000000,odom,1,2,3,0,0,0,1\n7,750000000,odom,1,2,3,0,0,0,1\n"
+    (tmp_path / "t.csv").write_text(f"{names},frame_id,x,y,z,qx,qy,qz,qw\n{rows}")
+    np.testing.assert_allclose(read_poses(tmp_path / "t.csv").time_s, [7.25, 7.75])
+
+
+@pytest.mark.parametrize(
+    ("name", "scale"),
+    [("time_ms", 1e3), ("timestamp_us", 1e6), ("time [ms]", 1e3), ("stamp_ns", 1e9), ("t (us)", 1e6), ("time_s", 1.0),
+     ("timestamp [ns]", 1e9)],
+)  # fmt: skip
+def test_the_unit_of_times_is_that_of_the_header(tmp_path: Path, name: str, scale: float) -> None:
+    rows = "".join(f"{time_s * scale:.0f},1,2,3,0,0,0,1\n" for time_s in (0, 1, 60))
+    (tmp_path / "t.csv").write_text(f"{name},x,y,z,qx,qy,qz,qw\n{rows}")
+    np.testing.assert_allclose(read_poses(tmp_path / "t.csv").time_s, [0, 1, 60])
+
+
+def test_the_unit_of_angles_is_that_of_the_header(tmp_path: Path) -> None:
+    def yaw_rad(unit: str, yaw: float) -> float:
+        (tmp_path / "t.csv").write_text(f"x,y,z,roll{unit},pitch{unit},yaw{unit}\n1,2,3,0,0,{yaw}\n")
+        (pose,) = read_poses(tmp_path / "t.csv").poses
+        return float(np.arctan2(pose[1, 0], pose[0, 0]))
+
+    assert yaw_rad("_deg", 5.0) == pytest.approx(np.radians(5.0))
+    assert yaw_rad("_rad", 6.0) == pytest.approx(6.0 - 2 * np.pi)
+    assert yaw_rad("", 90.0) == pytest.approx(np.pi / 2)
+    with pytest.warns(InputWarning, match="are taken for radians"):
+        assert yaw_rad("", 0.5) == pytest.approx(0.5)
