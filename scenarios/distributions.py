@@ -125,12 +125,18 @@ class _Drawer:
             return int(generator.integers(*argument))
         return float(generator.uniform(*argument) if name == "uniform" else generator.normal(*argument))
 
-    def _mapping(self, tree: dict[str, Any], source: Key, place: Key, path: tuple[str, ...]) -> Any:
+    def _mapping(self, tree: dict[str, Any], source: Key, place: Key, path: tuple[str, ...], depth: int = 0) -> Any:
         options: Any = tree.get("one_of")
         chosen: Any = {}
         if options is not None and not _one_of_rule(options):
-            index = int(self._generator((*path, "one_of")).integers(len(options)))
-            chosen = self.value(options[index], (*source, "one_of", index), place, path)
+            # alternatives of alternatives are draws of their own
+            index = int(self._generator((*path, *("one_of",) * (depth + 1))).integers(len(options)))
+            option, origin = options[index], (*source, "one_of", index)
+            if isinstance(option, dict) and not is_distribution(option) and not _distribution_rule(option):
+                self.origins[place] = origin
+                chosen = self._mapping(option, origin, place, path, depth + 1)
+            else:
+                chosen = self.value(option, origin, place, path)
         own = {
             key: self.value(item, (*source, key), (*place, key), (*path, str(key)))
             for key, item in tree.items()
@@ -191,7 +197,7 @@ def _is_range(value: Any) -> bool:
 
 
 _FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "uniform": ("[a, b] with a <= b", lambda value: _is_pair(value) and value[0] <= value[1]),
+    "uniform": ("[a, b] with a <= b", lambda value: _is_pair(value) and 0 <= value[1] - value[0] < math.inf),
     "normal": ("[mean, sigma] with sigma >= 0", lambda value: _is_pair(value) and value[1] >= 0),
     "integers": ("[a, b] with whole a < b, b excluded", _is_range),
     "choice": ("[..] with at least one alternative", lambda value: isinstance(value, list) and len(value) > 0),

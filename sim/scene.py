@@ -163,7 +163,9 @@ def lay_ground(scenario: Scenario, seed: int) -> Ground:
         ScenarioError: As `build_world`; or the scenario's world is a recording.
     """
     if isinstance(scenario, GraftScenario):
-        raise ScenarioError(f"{scenario.family}: its world is a recording: `tunnelcd simulate` makes a pair, which other commands read")
+        raise ScenarioError(
+            f"{scenario.family}: its world is a recording: `tunnelcd simulate` makes a pair, which other commands read"
+        )
     tunnel = scenario.tunnel
     centreline = build_centreline(tunnel, seed)
     wall = mesh_tunnel(tunnel, centreline, seed) if tunnel.mesh is None else tunnel_mesh(tunnel.mesh)

@@ -21,6 +21,7 @@ from sim.scene import Scene, World
 
 # Tolerance for comparing times and distances, so that rounding drops no revolution.
 _SLACK = 1e-6
+_MOST_TURNS = 10_000_000  # eleven days at 10 Hz
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,6 +183,11 @@ def recorded(true: Motion, platform: Platform, rate_hz: float, session: str) -> 
         raise ScenarioError(
             f"{session}: the drive takes {duration_s:.3f} s, less than one revolution at {rate_hz:g} Hz: "
             "give a longer route or trajectory"
+        )
+    if n_turns > _MOST_TURNS:
+        raise ScenarioError(
+            f"{session}: the drive takes {duration_s:.3g} s, {n_turns:.3g} revolutions at {rate_hz:g} Hz: at most "
+            f"{_MOST_TURNS} are simulated: drive faster"
         )
     middle_s = true.time_s[0] + (np.arange(n_turns, dtype=np.float64) + 0.5) / rate_hz
     way_m = np.interp(middle_s, true.time_s, true.way_m)

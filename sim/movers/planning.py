@@ -25,6 +25,7 @@ Name = TypeVar("Name", bound=str)  # of a session
 _TRIES = 80  # places that the seed draws, as for a prop
 _SHORTER = (1.0, 0.5, 0.25, 0.1)  # shares of its length that a drawn stretch has, each for so many places
 _STARTS = 8  # times at which it may start, at each place
+_ROWS = {"before": 0, "after": 1}
 _PROP_GAP_M = 0.1
 _ALONG_M = 0.25  # between the places at which a mover is checked against props, and four times that against rock
 _WATCH_S = 0.1  # between the times at which its distance to the sensor is measured
@@ -95,13 +96,20 @@ def _plan(mover: Mover, instance: int, sites: Sequence[_Site], seed: int) -> lis
         facing = float(generator.uniform(-np.pi, np.pi))
         try:
             body = MovingBody(mover, instance, *_settle(mover, figure, stand, lateral, facing, sites[0]))
-            return [_fit(body, starts[int(site.session == "after")], site) for site in sites]
+            return [_fit(body, _starts_in(site.session, starts, mover, seed), site) for site in sites]
         except ScenarioError as error:
             refusal = str(error)
     raise ScenarioError(
         f"{sessions}: mover {mover.name!r} finds no way: {refusal}: give it another path or lateral, or lower "
         "platform.clearance_m"
     )
+
+
+def _starts_in(session: str, starts: Float64Array, mover: Mover, seed: int) -> Float64Array:
+    """Return the phases to try in a session: a row (T,) of (2, T) `starts` in a pair, own draws in further sessions."""
+    if session in _ROWS:
+        return np.asarray(starts[_ROWS[session]])
+    return stream(seed, session, "mover", mover.name, "phase").random(_STARTS)
 
 
 def _fit(body: MovingBody, starts: Float64Array, site: _Site) -> MovingBody:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import ScenarioError
-from cdpipe.core.geometry import Float64Array, make_pose, stream
+from cdpipe.core.geometry import Float64Array, make_pose, stream, yaw_pose
 from scenarios.schema import Place, Prop, Scenario
 from sim.placement.fitting import Spot, place_prop
 from sim.placement.lanes import Lane, build_lanes
@@ -21,6 +21,7 @@ from sim.placement.placing import (
     grow_rectangle,
     rectangles_overlap,
     standing_corners,
+    standing_middle,
 )
 from sim.placement.settling import settle
 from sim.placement.stations import PLACE_TRIES, Stations, draw_areas, drawn_spots, given_spot, way
@@ -118,8 +119,13 @@ def age(item: Standing) -> list[Standing]:
     aged = item.prop.aged
     if aged is None:
         return [item]
-    turned = make_pose(Rotation.from_euler("ZX", [aged.turn_deg, aged.lean_deg], degrees=True).as_matrix())
-    pose = item.world_T_object @ turned
+    if item.posture == "upright":
+        turned = make_pose(Rotation.from_euler("ZX", [aged.turn_deg, aged.lean_deg], degrees=True).as_matrix())
+        pose = item.world_T_object @ turned
+    else:  # its own z axis lies
+        upright = yaw_pose(np.deg2rad(aged.turn_deg), standing_middle(item))
+        leant = make_pose(Rotation.from_euler("X", aged.lean_deg, degrees=True).as_matrix())
+        pose = upright @ yaw_pose(0.0, -standing_middle(item)) @ item.world_T_object @ leant
     heading = np.deg2rad(aged.heading_deg)
     pose[:3, 3] += (aged.shift_m * np.cos(heading), aged.shift_m * np.sin(heading), -aged.sag_m)
     return [replace(item, sessions=_BEFORE), replace(item, sessions=_AFTER, world_T_object=pose)]
@@ -165,9 +171,9 @@ def _at_spot(job: _Job, spot: Spot, board: _Board) -> list[Standing]:
         items.append(replace(items[0], shape=job.rest, sessions=_AFTER))
     if prop.shift is not None:
         heading = np.arctan2(spot.heading[1], spot.heading[0]) + np.deg2rad(prop.shift.heading_deg)
-        goal = pose[:2, 3] + prop.shift.distance_m * np.array([np.cos(heading), np.sin(heading)])
-        moved_to = np.append(goal, np.deg2rad(prop.shift.turn_deg))
-        pose, wall = place_prop(prop, shape, place, spot, board.around, board.seed, moved_to)
+        way_m = prop.shift.distance_m * np.array([np.cos(heading), np.sin(heading)])
+        moved = np.append(way_m, np.deg2rad(prop.shift.turn_deg))
+        pose, wall = place_prop(prop, shape, place, spot, board.around, board.seed, moved)
         items.append(Standing(prop, shape, _AFTER, pose, place.posture, wall))
     return items
 

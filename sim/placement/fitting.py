@@ -60,7 +60,7 @@ def place_prop(
     spot: Spot,
     around: Surroundings,
     seed: int,
-    shift_xy: Float64Array | None = None,
+    moved: Float64Array | None = None,
 ) -> tuple[Float64Array, Float64Array | None]:
     """Return the pose (4, 4) of a prop at a spot before it settles, and the direction (2,) of its wall, if it has one.
 
@@ -71,22 +71,24 @@ def place_prop(
         spot: Where along the tunnel.
         around: The tunnel.
         seed: Draws on which side a tipped prop lies and how far one leans.
-        shift_xy: (3,) for a prop moved a little: x, y of where it stands instead, and its turn in radians.
+        moved: (3,) for a prop moved a little: how far its middle moves along x and y, and its turn in radians.
 
     Raises:
         ScenarioError: It does not fit there.
     """
     yaw = float(np.arctan2(spot.heading[1], spot.heading[0]) + np.deg2rad(place.yaw_deg))
-    start = None if shift_xy is None else shift_xy[:2]
-    yaw += 0.0 if shift_xy is None else float(shift_xy[2])
     if place.posture == "leaning":
-        return _at_wall(prop, shape, place, spot, around, seed, yaw, start)
+        pose, wall = _at_wall(prop, shape, place, spot, around, seed, yaw, None)
+        if moved is None:
+            return pose, wall
+        return _at_wall(prop, shape, place, spot, around, seed, yaw + float(moved[2]), pose[:2, 3] + moved[:2])
+    yaw += 0.0 if moved is None else float(moved[2])
     rotation = draw_rotation(prop.name, shape, place.posture, seed)
     low, high = box = _bounds(shape, rotation, place.posture)
-    if spot.is_line and start is None:
-        position = _across(prop, (high - low) / 2, place, spot, around)
-    else:
-        position = spot.point[:2] if start is None else start
+    position = _across(prop, (high - low) / 2, place, spot, around) if spot.is_line else spot.point[:2]
+    if moved is not None:
+        position = position + moved[:2]
+    if moved is not None or not spot.is_line:
         _require_clear(prop, high - low, yaw, position, spot, around)
     floor_m = _floor_under(prop, box, position, yaw, spot, around)
     centre = np.append((low[:2] + high[:2]) / 2, low[2])

@@ -22,6 +22,7 @@ DEEPEST_M = 0.01  # of any point of a prop at rest in rock
 _DROP_M = 0.02
 # MuJoCo keeps at most 50 contacts of a geom with a height field and drops the rest: a large box on a fine grid tips.
 _PATCH_STEPS_PER_LENGTH = 3.5
+_MOST_PATCH_STEPS = 200  # of a prop of 7 mm
 _WALL_STEP_M = 0.15
 _TIMESTEP_S = 0.002
 _LONGEST_S = 8.0
@@ -126,7 +127,13 @@ def _add_floor(
     # One that is not upright may yet turn on any side.
     reach = size[:2] if item.posture == "upright" else np.full(2, np.ptp(points, axis=0).max())
     half_m = 0.5 * float(np.hypot(*reach)) + 0.4
-    count = 2 * int(np.ceil(half_m * _PATCH_STEPS_PER_LENGTH / max(item.shape.size_m[:2]))) + 1
+    n_steps = half_m * _PATCH_STEPS_PER_LENGTH / max(item.shape.size_m[:2])
+    if n_steps > _MOST_PATCH_STEPS:
+        raise ScenarioError(
+            f"props.{item.prop.name}.size_m = {list(item.prop.size_m or ())}: too small to come to rest on the floor: "
+            "make it larger"
+        )
+    count = 2 * int(np.ceil(n_steps)) + 1
     x, y = (world[:, :2].min(axis=0) + world[:, :2].max(axis=0)) / 2
     z = world[:, 2].min()
     axis = np.linspace(-half_m, half_m, count)

@@ -15,7 +15,7 @@ from scenarios.schema import Scenario
 from sim.geometry.mesh import Mesh, NearSurface, crop_near, drop_unused_vertices, join_meshes, split_triangles
 from sim.geometry.raycast import Caster
 from sim.placement.contact import standing_surface
-from sim.placement.placing import Standing
+from sim.placement.placing import Standing, standing_corners, standing_middle
 from sim.sensor.rays import Rays
 from sim.session.truth import SESSIONS, Change, Group, Kind, SessionName
 
@@ -179,13 +179,20 @@ def list_changes(scenario: Scenario, world: Compared) -> list[Tally]:
         if prop.loaded_share is not None:
             tallies.append(_tally_reshaped(len(tallies) + 1, instance, start, end, world))
             continue
-        moved_m = np.linalg.norm(end.world_T_object[:3, 3] - start.world_T_object[:3, 3])
-        # A short move is one by less than the longer side of the prop's footprint.
-        group: Group = "partial" if moved_m < max(start.shape.size_m[:2]) else "full"
+        group: Group = "partial" if _is_short_move(start, end) else "full"
         first_id = len(tallies) + 1
         tallies.append(_tally(first_id, instance, start, world, group, first_id + 1))
         tallies.append(_tally(first_id + 1, instance, end, world, group, first_id))
     return tallies
+
+
+def _is_short_move(start: Standing, end: Standing) -> bool:
+    """Tell whether a prop moved by less than the longer side of its footprint, as it lies or stands."""
+    if start.posture == end.posture == "upright":
+        moved_m = np.linalg.norm(end.world_T_object[:3, 3] - start.world_T_object[:3, 3])
+        return bool(moved_m < max(start.shape.size_m[:2]))
+    moved_m = np.linalg.norm((standing_middle(end) - standing_middle(start))[:2])
+    return bool(moved_m < np.linalg.norm(np.diff(standing_corners(start), axis=0), axis=1).max())
 
 
 def mark_belonging(tally: Tally, points_world: Float64Array) -> BoolArray:

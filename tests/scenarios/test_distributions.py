@@ -104,6 +104,12 @@ def test_one_of_merges_a_drawn_mapping_under_the_mapping_s_own_keys() -> None:
         assert mapping == [first, second][stream(seed, "scenario", "m.one_of").integers(2)]
 
 
+def test_all_alternatives_of_alternatives_occur() -> None:
+    tree = {"one_of": [{"k": "A", "one_of": [{"s": 1}, {"s": 2}]}, {"k": "B", "one_of": [{"s": 3}, {"s": 4}]}]}
+    found = [(drawn["k"], drawn["s"]) for drawn in (draw({"m": tree}, seed)["m"] for seed in range(80))]
+    assert set(found) == {("A", 1), ("A", 2), ("B", 3), ("B", 4)}
+
+
 def test_adding_a_prop_or_a_key_changes_no_other_draw() -> None:
     props = [
         {"name": "a", "repeat": {"integers": [1, 4]}, "at": [{"uniform": [0, 1]}, {"normal": [0, 1]}]},
@@ -143,6 +149,7 @@ def test_every_malformed_distribution_is_told_at_once() -> None:
         "h": {"unifrom": [1, 2]},
         "i": {"uniform": [1, 2], "normal": [0, 1]},
         "j": {"uniform": [float("nan"), 1]},
+        "l": {"uniform": [-1e308, 1e308]},
         "k": [{"repeat": -1}, {"repeat": {"uniform": [1, 2]}}, {"chance": 2}, {"one_of": []}],
         "fine": [{"repeat": {"choice": [1, {"integers": [0, 2]}]}, "chance": 0.5}],
     }
@@ -153,6 +160,7 @@ def test_every_malformed_distribution_is_told_at_once() -> None:
         "h",
         "i",
         "j",
+        "l",
         "k.0.repeat",
         "k.1.repeat",
         "k.2.chance",

@@ -248,6 +248,8 @@ def test_impossible_drives_are_refused(
         plan(before=SessionPlan(route=("a", "b", "a")))
     with pytest.raises(ScenarioError, match=r"before: platform\.scan_spacing_m = 0\.05: at 1 m/s, .* are 0\.1 m apart"):
         plan(platform=Platform(scan_spacing_m=0.05))
+    with pytest.raises(ScenarioError, match=r"before: the drive takes .* at most 10000000 are simulated: drive faster"):
+        plan(platform=Platform(speed_mps=1e-9))
     with pytest.raises(ScenarioError, match=r"at 1\.\d+ m/s, \d+\.\d m along the way, .* give at least that, or drive"):
         plan(platform=Platform(scan_spacing_m=0.1, speed_variation=0.3))
     with pytest.raises(ScenarioError, match=r"before: the drive takes 0\.\d+ s, less than one revolution at 10 Hz"):

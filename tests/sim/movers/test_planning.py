@@ -111,6 +111,17 @@ def test_a_curtain_hangs_at_one_place_in_both_sessions_and_swings_on(plan: Plan)
     assert np.linalg.norm(walkers[0].course.points - walkers[1].course.points) > 0.5  # people go where they like
 
 
+def test_a_curtain_has_another_phase_in_every_session_of_a_story(
+    scenario: Scenario, world: World, robots: dict[SessionName, Motion]
+) -> None:
+    drawn = scenario.model_copy(update={"movers": (Mover.model_validate(KINDS[3]),)})
+    names = ("before", "after", "session-01", "session-02")
+    bodies = [plan_movers(world, drawn, {name: robots["after"]}, SEED)[name][0] for name in names]
+    for body in bodies[1:]:
+        np.testing.assert_array_equal(body.course.points, bodies[0].course.points)
+    assert len({body.course.offset_s for body in bodies}) == 4
+
+
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [

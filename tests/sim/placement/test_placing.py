@@ -8,6 +8,7 @@ import pytest
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float32Array, Float64Array
 from scenarios.schema import (
+    Aged,
     Area,
     Drift,
     Furniture,
@@ -22,10 +23,18 @@ from scenarios.schema import (
     Tunnel,
 )
 from sim.placement import fitting, stations
-from sim.placement.placing import Standing, grow_rectangle, rectangles_overlap, standing_corners
+from sim.placement.placing import (
+    Standing,
+    grow_rectangle,
+    rectangles_overlap,
+    standing_corners,
+    standing_middle,
+    standing_points,
+)
 from sim.placement.stations import draw_areas
 from sim.rock.centreline import Centreline, build_centreline
 from sim.scene import World, build_world
+from sim.session.labels import list_changes
 
 MakeScenario = Callable[..., Scenario]
 MakeProp = Callable[..., Prop]
@@ -81,6 +90,35 @@ def test_a_shift_is_along_the_drift_whatever_the_yaw(make_scenario: MakeScenario
     assert [sorted(item.sessions) for item in world.standing] == [["before"], ["after"]]
     with pytest.raises(ScenarioError, match="prop 'box' "):
         build_world(make_scenario(tunnel=LEVEL, props=(make_prop("box", 0.4, 0.9, change="moved", shift=shift),)), 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_middle_of_a_lying_prop_moves_by_the_shift(
+    make_scenario: MakeScenario, make_prop: MakeProp, seed: int
+) -> None:
+    shift = Shift(distance_m=0.4, heading_deg=0.0, turn_deg=40.0)
+    lying = Place(between=("a", "b"), fraction=0.4, lateral=0.0, posture="tipped")
+    barrel = make_prop("barrel", kind="barrel", size_m=(0.58, 0.58, 0.9), place=lying, change="moved", shift=shift)
+    scenario = make_scenario(tunnel=LEVEL, props=(barrel,))
+    world = build_world(scenario, seed)
+    start, end = (standing_middle(item) for item in world.standing)
+    np.testing.assert_allclose((end - start)[:2], [0.4, 0.0], atol=0.02)
+    # less than its 0.9 m, more than its 0.58 m: much of it covers where it lay
+    assert {tally.change.group for tally in list_changes(scenario, world)} == {"partial"}
+
+
+def test_a_lying_prop_that_aged_turns_on_the_floor(make_scenario: MakeScenario, make_prop: MakeProp) -> None:
+    lying = Place(between=("a", "b"), fraction=0.4, lateral=0.0, posture="tipped")
+    box = make_prop("box", size_m=(0.6, 0.5, 0.8), place=lying, aged=Aged(turn_deg=20.0))
+    before, after = build_world(make_scenario(tunnel=LEVEL, props=(box,)), 1).standing
+    assert standing_points(after)[:, 2].min() == pytest.approx(standing_points(before)[:, 2].min(), abs=1e-6)
+    np.testing.assert_allclose(standing_middle(after)[:2], standing_middle(before)[:2], atol=0.03)
+
+
+def test_a_prop_too_small_for_the_floor_is_refused(make_scenario: MakeScenario, make_prop: MakeProp) -> None:
+    grain = make_prop("grain", kind="rock", size_m=(0.001, 0.001, 0.001))
+    with pytest.raises(ScenarioError, match=r"props\.grain\.size_m = .*: too small to come to rest on the floor: make"):
+        build_world(make_scenario(tunnel=LEVEL, props=(grain,)), 0)
 
 
 def test_a_drawn_prop_is_tried_again_until_its_shift_fits(make_scenario: MakeScenario, make_prop: MakeProp) -> None:
