@@ -27,6 +27,7 @@ _FASTEST_M_PER_S = 20.0
 _FLAT, _ROUND = 0.12, 0.25
 _MIN_RETURNS = 100
 _MAX_TILT_DEG = 45.0
+_STANDING_M = 1.0
 # Largest ratio of the median ranges of two sessions of one tunnel.
 _SAME_TUNNEL = 1.4
 # Tolerance factor of a ratio of lengths against a ratio of units.
@@ -148,6 +149,8 @@ def _require_up(source: ScanSource, directions: Float64Array, spacing_m: float) 
                     "x forward and z up (a camera's frame has z forward): turn the points and the poses"
                 )
     positions = poses[choose_keyframes(poses, spacing_m), :3, 3]
+    if np.ptp(positions, axis=0).max() < _STANDING_M:  # the way of a sensor that stands is the noise of its odometry
+        return
     steps = np.diff(positions, axis=0)
     slope_deg = float(np.degrees(np.arctan2(np.abs(steps[:, 2]).sum(), np.linalg.norm(steps[:, :2], axis=1).sum())))
     if slope_deg > _MAX_TILT_DEG:

@@ -32,6 +32,8 @@ BOTH_WAYS_M, BOTH_WAYS_DEG = 0.05, 0.5
 # Points sampled from a sphere, and the longest correspondence.
 _SAMPLES = 300
 _COUNTERPART_M = 0.5
+# Distance up to which a point holds the alignment.
+_FITS_M = 0.1
 # Shares of points without a counterpart at which a session is asked whether mist hid them from it.
 _MISSING = (0.02, 0.5)
 
@@ -45,8 +47,9 @@ class SurfaceFit:
             is over 0.5 m away.
         backward_m: (M,) the same for before points to the after map.
             Points that mist or dust hid from the other session are in neither.
-        information: (6, 6) Hessian of the forward distances: rotation, then translation, after odom axes about the
-            place. If all normals are orthogonal to one direction, the translation along it is unconstrained.
+        information: (6, 6) Hessian of the forward distances within 0.1 m: rotation, then translation, after odom axes
+            about the place. If all normals are orthogonal to one direction, the translation along it is unconstrained.
+            What does not fit constrains nothing: objects or niches that one session alone has.
     """
 
     forward_m: Float64Array
@@ -90,8 +93,8 @@ def measure_fit(
     found, squared_m2 = search_nearest(fine.tree, moved)
     normals = fine.normals[found]
     forward_m = plane_distances(moved, fine.points[found], normals, squared_m2)
-    is_seen = np.isfinite(forward_m)
-    jacobian = plane_jacobian(own[is_seen] - centre_after, normals[is_seen] @ before_T_after[:3, :3])
+    is_fit = forward_m <= _FITS_M
+    jacobian = plane_jacobian(own[is_fit] - centre_after, normals[is_fit] @ before_T_after[:3, :3])
     information = jacobian.T @ jacobian
 
     chosen = sample_evenly(before.columns.crop(centre_before, radius_m))

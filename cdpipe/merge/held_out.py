@@ -29,7 +29,7 @@ def choose_alignment(
     odom_T_keyframe: Float64Array,
     places: Int64Array,
     refined: Float64Array,
-    rigid: Float64Array,
+    given: Float64Array,
     radius_m: float,
     within_m: float,
 ) -> tuple[Float64Array | None, dict[str, float]]:
@@ -44,13 +44,14 @@ def choose_alignment(
         odom_T_keyframe: (K, 4, 4) poses of the after keyframes.
         places: (A,) keyframes to judge at, rising.
         refined: (K, 4, 4) refined `before_T_after` at each keyframe.
-        rigid: (4, 4) rigid `before_T_after`.
+        given: (4, 4) `before_T_after` without the refinement, or (K, 4, 4) at each keyframe.
         radius_m: Points within this distance judge a place, metres.
-        within_m: A place that the refinement moves farther keeps the rigid merge, metres.
+        within_m: A place that the refinement moves farther keeps the given merge, metres.
 
     Returns:
-        (K, 4, 4) alignments, None if the rigid merge is to be kept at every place.
+        (K, 4, 4) alignments, None if the given merge is to be kept at every place.
     """
+    given = np.broadcast_to(given, refined.shape)
     positions, path_m = odom_T_keyframe[:, :3, 3], travelled_m(odom_T_keyframe)
     index = GridIndex(held_out)
     points = [sample_evenly(index.points_within(centre, radius_m), _JUDGES) for centre in positions[places]]
@@ -60,11 +61,11 @@ def choose_alignment(
     places, points = places[is_judged], [each for each in points if len(each) >= _MIN_JUDGES]
     misfits = np.array(
         [
-            [_measure_misfit(before, pose, own) for pose in (rigid, refined[place])]
+            [_measure_misfit(before, poses[place], own) for poses in (given, refined)]
             for place, own in zip(places, points, strict=True)
         ]
     )
-    moved_m = np.linalg.norm(transform_each(refined, positions) - transform(rigid, positions), axis=1)
+    moved_m = np.linalg.norm(transform_each(refined, positions) - transform_each(given, positions), axis=1)
     is_kept = _is_refined_better(misfits) & (moved_m[places] <= within_m)
     rigid_misfit, refined_misfit = misfits.mean(axis=0).tolist()
     evidence = {
@@ -75,7 +76,7 @@ def choose_alignment(
     }
     if not is_kept.any():
         return None, evidence
-    return _blend(rigid, refined, np.interp(path_m, path_m[places], is_kept), positions), evidence
+    return _blend(given, refined, np.interp(path_m, path_m[places], is_kept), positions), evidence
 
 
 def _measure_misfit(before: IndexedMap, before_T_after: Float64Array, own: Float64Array) -> float:
@@ -92,9 +93,10 @@ def _is_refined_better(misfits: Float64Array) -> BoolArray:
     return np.asarray(gains[:-2] + gains[1:-1] + gains[2:] > 0)
 
 
-def _blend(rigid: Float64Array, refined: Float64Array, shares: Float64Array, positions: Float64Array) -> Float64Array:
-    """Return the (K, 4, 4) poses between the rigid and the refined ones, by (K,) shares of the refined ones."""
-    turns = Rotation.from_matrix(rigid[:3, :3].T @ refined[:, :3, :3]).as_rotvec()
-    rotations = rigid[:3, :3] @ Rotation.from_rotvec(shares[:, None] * turns).as_matrix()
-    moved = (1 - shares[:, None]) * transform(rigid, positions) + shares[:, None] * transform_each(refined, positions)
+def _blend(given: Float64Array, refined: Float64Array, shares: Float64Array, positions: Float64Array) -> Float64Array:
+    """Return the (K, 4, 4) poses between the given and the refined ones, by (K,) shares of the refined ones."""
+    turns = Rotation.from_matrix(given[:, :3, :3].swapaxes(1, 2) @ refined[:, :3, :3]).as_rotvec()
+    rotations = given[:, :3, :3] @ Rotation.from_rotvec(shares[:, None] * turns).as_matrix()
+    first, last = (transform_each(poses, positions) for poses in (given, refined))
+    moved = (1 - shares[:, None]) * first + shares[:, None] * last
     return make_pose(rotations, moved - np.einsum("kij,kj->ki", rotations, positions))

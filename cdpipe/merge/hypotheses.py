@@ -6,7 +6,7 @@ registered finely and walked along the path (`walk`), which measures its evidenc
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,6 +43,8 @@ _OTHER_MOTION_M = 1.0
 _DISTINCT = 10.0
 # Fewest places besides the start that make evidence; lowest fit of a place that contributes to the alignment.
 _MIN_PLACES, _GOOD_FIT = 3, 0.7
+# Largest extent of a recording of one place.
+_ONE_PLACE_M = 2.5
 # A recording of one place: voxel size, correspondences one after the other, and points that measure the fit.
 _FINE_M, _FINE_REACHES_M, _ALL_SAMPLES = 0.2, (1.0, 0.5, 0.25, 0.25), 2000
 # Cosine of 15 degrees, the largest tilt between the two maps.
@@ -126,15 +128,21 @@ def start_by_kiss_matcher(maps: tuple[IndexedMap, IndexedMap], config: MergeConf
 
 
 def choose_hypothesis(
-    starts: Iterable[Start], maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
-) -> tuple[Hypothesis | None, int]:
+    starts: Iterable[Start],
+    maps: tuple[IndexedMap, IndexedMap],
+    config: MergeConfig,
+    earlier: Sequence[Hypothesis] = (),
+) -> tuple[Hypothesis | None, list[Hypothesis]]:
     """Walk the starts in order until one is accepted, then the remaining starts that fit about as well.
 
     In a repetitive tunnel several alignments pass all gates. The one with the smallest residual along the path is
-    chosen; `distinctness` is the ratio to the next one.
+    chosen; `distinctness` is the ratio to the next one. What was accepted of earlier starts stays a rival.
+
+    Returns:
+        The choice, None without hypotheses; and all of them, the earlier ones first.
     """
-    judged: list[Hypothesis] = []
-    accepted: list[Hypothesis] = []
+    judged = list(earlier)
+    accepted = [each for each in judged if not explain_refusal(each.evidence, config)]
     best_share = 0.0
     for start in starts:
         best_share = max(best_share, start.share)
@@ -144,14 +152,14 @@ def choose_hypothesis(
         if not explain_refusal(judged[-1].evidence, config):
             accepted.append(judged[-1])
     if not accepted:
-        return max(judged, key=lambda each: np.nan_to_num(each.evidence["agreement"]), default=None), len(judged)
+        return max(judged, key=lambda each: np.nan_to_num(each.evidence["agreement"]), default=None), judged
     best, *others = sorted(accepted, key=_path_residual_m)
     place = maps[1].positions[best.walk.keyframes[0]]
     rivals = [o for o in others if motion_between(o.before_T_after, best.before_T_after, place)[0] > _OTHER_MOTION_M]
     if rivals:
         ratio = min(_path_residual_m(rivals[0]) / _path_residual_m(best), _DISTINCT)
         best = replace(best, evidence={**best.evidence, "distinctness": ratio})
-    return best, len(judged)
+    return best, judged
 
 
 def _is_rival(
@@ -205,7 +213,7 @@ def judge(start: Start, maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
         "agreement": float(fits.mean()) if len(fits) >= _MIN_PLACES else float("nan"),
         "distinctness": _DISTINCT,
     }
-    if config.method != "frame" and min(len(before.positions), len(after.positions)) <= _MIN_PLACES:
+    if config.method != "frame" and (_is_one_place(before) or _is_one_place(after)):
         pose, of_place = _judge_one_place(start, pose, maps, config)
         evidence |= of_place
         walked = replace(walked, before_T_after=np.repeat(pose[None], len(walked.keyframes), axis=0))
@@ -213,6 +221,12 @@ def judge(start: Start, maps: tuple[IndexedMap, IndexedMap], config: MergeConfig
     if config.method != "frame" and is_good.any():
         pose = fit_rigid(after.positions[walked.keyframes[is_good]], walked.before_T_after[is_good])
     return Hypothesis(pose, walked, evidence)
+
+
+def _is_one_place(indexed: IndexedMap) -> bool:
+    """Tell whether a session has no further places; the odometry of a sensor that stands may jitter for a long way."""
+    positions = indexed.positions
+    return len(positions) <= _MIN_PLACES or bool(np.ptp(positions, axis=0).max() < _ONE_PLACE_M)
 
 
 def _judge_one_place(

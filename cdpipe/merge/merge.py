@@ -140,7 +140,8 @@ def take_known_merge(
             local, refined = None, found.before_T_after
     elif has_refinement:
         del maps
-        fitted, measured = refine(before.map, after.map, found.walk, before_T_after, config, within_m)
+        given = before_T_after if known_local is None else known_local.at(after.map.odom_T_keyframe[:, :3, 3])
+        fitted, measured = refine(before.map, after.map, found.walk, given, config, within_m)
         evidence |= measured
         if fitted is not None:
             local, refined = fitted, fit_rigid(fitted.anchors_odom, fitted.before_T_after)
@@ -168,21 +169,20 @@ def _find_hypothesis(
     """Return the accepted hypothesis or else the best one, how many were walked, and if KISS-Matcher was wanted."""
     if config.method == "frame":
         starts = start_by_frame(find_closest_pair(before, after), maps, config)
-        return *choose_hypothesis(starts, maps, config), False
-    best: Hypothesis | None = None
-    n_tried = 0
+        best, judged = choose_hypothesis(starts, maps, config)
+        return best, len(judged), False
+    best, judged = None, []
     if config.method == "voting":
         for every in list_tries(before, after, config):
             if every == 1:
                 before, after = before.described(), after.described()
             starts = rank_starts(find_candidates(before, after, config, every), maps, config)
-            found, n_found = choose_hypothesis(starts, maps, config)
-            best, n_tried = found or best, n_tried + n_found
+            best, judged = choose_hypothesis(starts, maps, config, judged)
             if best is not None and not explain_refusal(best.evidence, config):
-                return best, n_tried, False
+                return best, len(judged), False
         if not (config.fallback and is_kiss_matcher_installed()):
-            return best, n_tried, config.fallback
-    other, n_other = choose_hypothesis(start_by_kiss_matcher(maps, config), maps, config)
-    if other is not None and (best is None or not explain_refusal(other.evidence, config)):
+            return best, len(judged), config.fallback
+    other, judged = choose_hypothesis(start_by_kiss_matcher(maps, config), maps, config, judged)
+    if best is None or (other is not None and not explain_refusal(other.evidence, config)):
         best = other
-    return best, n_tried + n_other, True
+    return best, len(judged), True

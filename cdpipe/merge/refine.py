@@ -55,7 +55,7 @@ def refine(
     before_map: PointMap,
     after_map: PointMap,
     found: Walk,
-    rigid: Float64Array,
+    given: Float64Array,
     config: MergeConfig,
     within_m: float = np.inf,
 ) -> tuple[PathAlignment | None, dict[str, float]]:
@@ -68,12 +68,12 @@ def refine(
         before_map: The before map.
         after_map: The after map.
         found: The accepted walk.
-        rigid: (4, 4) `before_T_after` of the rigid merge.
+        given: (4, 4) `before_T_after` of the merge, or (K, 4, 4) at every after keyframe.
         config: Settings of the merge.
-        within_m: The rigid merge holds at places that the refinement would move farther; used if it is checked.
+        within_m: The given merge holds at places that the refinement would move farther; used if it is checked.
 
     Returns:
-        The alignment at every after keyframe, or None if fewer than half of the registrations fit, or if the rigid
+        The alignment at every after keyframe, or None if fewer than half of the registrations fit, or if the given
         merge fits better everywhere.
     """
     if not np.isfinite(found.fits).any():
@@ -106,7 +106,7 @@ def refine(
         held_out = after_map.points[is_held_out & (after_map.nearest_m <= seen_within_m)]
         places = walked.keyframes[np.isfinite(walked.fits)]
         chosen, judged = choose_alignment(
-            before, held_out, after_map.odom_T_keyframe, places, local, rigid, radius_m, within_m
+            before, held_out, after_map.odom_T_keyframe, places, local, given, radius_m, within_m
         )
         evidence |= judged
         if chosen is None:

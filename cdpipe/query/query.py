@@ -34,6 +34,7 @@ _SURE = 3.0
 _FALL_PER_M = 0.1
 # The fall of shares: the sphere difference reaches 0.958 and 0.81 there; with a radius by the site 0.965 and 0.79.
 _SHARE_FALL_PER_M = 0.03
+_MUCH_SPARSER = 1.5
 
 
 def find_regions(
@@ -134,9 +135,9 @@ class _Places:
 
     @property
     def gap_m(self) -> float:
-        """Usual distance of two before keyframes, if the after keyframes lie closer together; else 0."""
+        """Usual distance of two before keyframes, if the after keyframes lie much closer together; else 0."""
         step_b, step_a = (_usual_step_m(each) for each in (self.before, self.after))
-        return step_b if step_b > step_a else 0.0
+        return step_b if step_b > _MUCH_SPARSER * step_a else 0.0
 
     def of(self, session: SessionName) -> Float64Array:
         """(K, 3) positions of the keyframes of a session."""

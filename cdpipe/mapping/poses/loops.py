@@ -23,6 +23,7 @@ from cdpipe.mapping.poses.scan_registration import MIN_PAIRS, Registration, Samp
 _SPACING_M, _APART_M = 4.0, 25.0
 # Two passes are candidates within this distance, which grows with the path between them.
 _NEAR_M, _NEAR_SHARE = 3.0, 0.03
+_MOST_PASSES = 4
 # Half the path that makes the map around a place: of the one that is registered, and of its target.
 _AROUND_M, _TARGET_M = 4.0, 10.0
 # Starts along the path of the target, and the registrations one after the other.
@@ -106,7 +107,10 @@ def _choose_places(path_m: Float64Array, spacing_m: float) -> Int64Array:
 
 
 def _find_candidates(path_m: Float64Array, poses: Float64Array) -> list[tuple[int, int]]:
-    """Return pairs of scans, the later first, that may have seen one place on two passes; of each pass the nearest."""
+    """Return pairs of scans, the later first, that may have seen one place on two passes; of each pass the nearest.
+
+    Of more than four earlier passes four are asked, so that time grows with the path and not with its square.
+    """
     places = _choose_places(path_m, _SPACING_M)
     positions = poses[:, :3, 3]
     candidates: list[tuple[int, int]] = []
@@ -116,7 +120,11 @@ def _find_candidates(path_m: Float64Array, poses: Float64Array) -> list[tuple[in
         is_near = (between_m >= _APART_M) & (away_m <= _NEAR_M + _NEAR_SHARE * between_m)
         near = np.flatnonzero(is_near)
         passes = np.split(near, np.flatnonzero(np.diff(path_m[near]) > _APART_M) + 1)
-        candidates += [(scan, int(one[np.argmin(away_m[one])])) for one in passes if len(one)]
+        nearest = [int(one[np.argmin(away_m[one])]) for one in passes if len(one)]
+        if len(nearest) > _MOST_PASSES:  # the first, the last and the nearest of the others tie all passes together
+            others = sorted(nearest[1:-1], key=lambda each: float(away_m[each]))[: _MOST_PASSES - 2]
+            nearest = sorted((nearest[0], nearest[-1], *others))
+        candidates += [(scan, each) for each in nearest]
     return candidates
 
 
