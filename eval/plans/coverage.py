@@ -14,29 +14,38 @@ from eval.plans.plan import Plan
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """Number of session pairs in the plan of a run, and of those with all of their cells; both 0 without a plan."""
+    """Number of session pairs in the plan of a run, and of those with all of their cells; both 0 without a plan.
+
+    `mistake` says why a plan that is there cannot be read.
+    """
 
     n_done: int
     n_planned: int
+    mistake: str = ""
 
     @property
     def is_whole(self) -> bool:
         """Whether all planned pairs are complete."""
-        return self.n_done == self.n_planned
+        return not self.mistake and self.n_done == self.n_planned
 
     @property
     def sentence(self) -> str:
         """The counts in words."""
+        if self.mistake:
+            return f"no verdict, as the plan of the run cannot be read here: {self.mistake}."
         return f"{self.n_done} of {self.n_planned} planned pairs so far: no verdict before all are there."
 
 
 def measure_coverage(provenance: Mapping[str, Any], cases: Iterable[tuple[str, int, str]]) -> Coverage:
-    """Compare the rows of a run with its latest plan; a run is whole where that is absent or not valid any more.
+    """Compare the rows of a run with its latest plan; a run is whole where that is absent.
 
     Args:
         provenance: Content of provenance.json.
         cases: Scenario, seed and variant of each row of results.csv.
     """
+    mistake = explain_unreadable_plan(provenance)
+    if mistake:
+        return Coverage(0, 0, mistake)
     plan = read_stored_plan(provenance)
     planned = set() if plan is None else list_planned_cases(plan)
     missing = planned - set(cases)
@@ -45,11 +54,21 @@ def measure_coverage(provenance: Mapping[str, Any], cases: Iterable[tuple[str, i
 
 
 def read_stored_plan(provenance: Mapping[str, Any]) -> Plan | None:
-    """Return the latest plan of a run; None where it is absent or not valid any more (a preset's file is gone)."""
+    """Return the latest plan of a run; None where it is absent or not valid here (a preset's file is elsewhere)."""
+    plan, _ = _read(provenance)
+    return plan
+
+
+def explain_unreadable_plan(provenance: Mapping[str, Any]) -> str:
+    """Return why the plan of a run is not valid here, "" where it is, or where there is none."""
+    return _read(provenance)[1]
+
+
+def _read(provenance: Mapping[str, Any]) -> tuple[Plan | None, str]:
     document = provenance.get("plan")
     if not isinstance(document, dict):
-        return None
+        return None, ""
     try:
-        return validate(Plan, Document("provenance.json", document))
-    except InputError:
-        return None
+        return validate(Plan, Document("provenance.json", document)), ""
+    except InputError as error:
+        return None, str(error).splitlines()[0]

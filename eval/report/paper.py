@@ -72,10 +72,11 @@ def _beside_the_paper(
         if scenario in published:
             values = (value.replace("-", EN_DASH).replace(" ", THIN_SPACE) for value in published[scenario])
             rows.append((scenario, (Cell("published"), *map(Cell, values))))
+        pictured = pictured_variants(data, scenario)
         rows += [
             (scenario, (Cell(f"ours, {name}"), *map(Cell, ours(scenario, name))))
             for name in named_variants(data, scenario)
-            if name in pictured_variants(data, scenario)
+            if name in pictured
         ]
     return Table(("method", *headings), tuple(rows), caption)
 

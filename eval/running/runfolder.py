@@ -43,7 +43,7 @@ from eval.core.output import make_writable, remove, require_no_links
 from eval.core.provenance import FORMAT_VERSION, TOOL
 from eval.core.statistics import summarise
 from eval.core.tablefile import read_table, write_rows
-from eval.plans.coverage import measure_coverage, read_stored_plan
+from eval.plans.coverage import explain_unreadable_plan, measure_coverage, read_stored_plan
 from eval.plans.targets import read_targets
 from eval.plans.worlds import world_slug
 from eval.running.cell_rows import ITEM_TABLES, SURFACE_TABLES, collect_tables, holds_rows
@@ -218,7 +218,7 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     for name, frame in tables.items():
         if len(frame):
             _write_csv(run.path / f"{name}.csv", frame)
-        else:
+        elif not (name in HARD_FILES and explain_unreadable_plan(run.stored_provenance())):
             remove(run.path / f"{name}.csv")
     return results
 

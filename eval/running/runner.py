@@ -86,14 +86,18 @@ def run_plan(
     """
     progress, tools = progress or Silent(), tools or TOOLS
     require_usable(where)
-    for place, earlier in _earlier_runs(run, mirror):
+    earlier_runs = _earlier_runs(run, mirror)
+    for place, earlier in earlier_runs:
         _require_one_split(place, earlier, plan)
         require_same_shard(place, earlier, shard)
+    place, earlier = next(((place, told) for place, told in earlier_runs if told), ("", {}))
     all_cells = expand_cells(plan)
     own_cells = choose_cells(all_cells, shard)
     told = {} if shard is None else {"shard": str(shard)}
     provenance = {**_provenance(plan, all_cells, command, tools), **told}
     if mirror is not None:
+        if earlier and not run.stored_provenance():  # an interrupt may leave cells of it
+            write_json(run.path / "provenance.json", {**earlier, "finished": None})
         mirror.fetch(run, progress)
     pairs = schedule_pairs(run, plan, all_cells, force, tools, shard=shard, keep=keep, is_lean=True, progress=progress)
     n_todo = sum(len(pair.todo) for pair in pairs)
@@ -105,8 +109,8 @@ def run_plan(
     results = None if n_todo else current_results(run, run.stored_provenance(), provenance)
     if not n_run:
         provenance = keep_makers(provenance, run.stored_provenance())
-    elif n_todo < len(own_cells) and (earlier := run.stored_provenance()):
-        provenance = resume_provenance(str(run.path), earlier, provenance)
+    elif earlier and _keeps_cells(run, pairs):
+        provenance = resume_provenance(place, earlier, provenance)
     # an unusable cluster is reported before anything is written
     with nullcontext() if where == HERE or not chosen else connected(where, len(chosen)) as client:
         if results is None:
@@ -129,6 +133,7 @@ def run_plan(
         results = write_tables(run)
         write_json(run.path / "provenance.json", {**provenance, "finished": provenance["finished"] or tools.now()})
     if mirror is not None:
+        mirror.copy_missing(run)
         mirror.copy_tables(run)
     n_died = int((results["status"] == "worker_died").sum())
     return RunOutcome(n_run, len(own_cells) - n_todo, n_todo - n_run, n_died)
@@ -212,6 +217,12 @@ def _earlier_runs(run: RunFolder, mirror: Mirror | None) -> list[tuple[str, Mapp
     return [here] if mirror is None else [here, (mirror.url, mirror.provenance())]
 
 
+def _keeps_cells(run: RunFolder, pairs: Sequence[Pair]) -> bool:
+    """Tell whether a folder holds finished cells besides those that are to run."""
+    todo = {run.cell(pair.name, pair.seed, each.cell.variant) for pair in pairs for each in pair.todo}
+    return any(cell not in todo for cell in run.path.glob("cells/*/*/*.json"))
+
+
 def _require_one_split(place: str, provenance: Mapping[str, Any], plan: Plan) -> None:
     """Refuse a folder with cells of another split: its tables would mix seeds that were looked at with sealed ones."""
     earlier = provenance.get("plan")
@@ -253,7 +264,7 @@ def _remove_stale(run: RunFolder, pair: Pair, force: bool) -> None:
     """Remove what is about to run again, so that no table holds it if the run is interrupted."""
     if not pair.todo:
         return
-    if force or not (_is_simulated(run.pair(pair.name, pair.seed), pair) or _is_dropped(run, pair)):
+    if force or not (_is_simulated(run.pair(pair.name, pair.seed), pair) or _is_dropped(run, pair) is True):
         _remove_pair(run, pair)
         remove(dropped_file(run, pair.name, pair.seed))
     for each in pair.todo:
@@ -267,16 +278,18 @@ def _remove_pair(run: RunFolder, pair: Pair) -> None:
     A damaged pair, or one that cannot be drawn any more, may be of the same world: answers of others stay.
     """
     held = run.pair(pair.name, pair.seed)
-    if _is_of_another_world(held, pair):
+    if _is_of_another_world(held, pair) or _is_dropped(run, pair) is False:
         for kind in ("cells", "answers"):
             remove(run.path / kind / held.parent.name / held.name)
     remove(held)
     remove(run.maps(pair.name, pair.seed))
 
 
-def _is_dropped(run: RunFolder, pair: Pair) -> bool:
-    drawn = None if pair.scenario is None else pair.scenario.model_dump(mode="json")
-    return drawn is not None and is_dropped(run, pair.name, pair.seed, drawn, pair.files)
+def _is_dropped(run: RunFolder, pair: Pair) -> bool | None:
+    """Tell whether removed sessions were of this world; None where none were removed, or it cannot be told."""
+    if pair.scenario is None:
+        return None
+    return is_dropped(run, pair.name, pair.seed, pair.scenario.model_dump(mode="json"), pair.files)
 
 
 def _settle(run: RunFolder, pairs: Sequence[Pair], keep: Keep | None, progress: RunProgress, tools: Tools) -> None:

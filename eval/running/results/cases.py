@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import pandas as pd
 
@@ -12,6 +13,7 @@ from eval.running.results.run_data import RunData
 from eval.running.results.values import Row, flag, number, select_rows, text
 from eval.tables.rows import with_domain
 
+_RUNS = 8  # whose cases are remembered
 _PICTURED = ("paper", "tunnelcd", "voxel-diff")
 
 
@@ -38,6 +40,7 @@ def scenarios(data: RunData, *, unchanged: bool) -> list[str]:
     return [name for name in names if is_unchanged(data, name) == unchanged]
 
 
+@lru_cache(maxsize=_RUNS)
 def find_repeats(data: RunData) -> dict[tuple[str, str], str]:
     """Return the reference world of each (world, variant) that is another with a setting (`eval.plans.worlds`)."""
     found = find_references(data.cases)
@@ -58,10 +61,16 @@ def is_unmade(row: Row) -> bool:
 
 def named_variants(data: RunData, scenario: str) -> list[str]:
     """Return the variants of a scenario that are neither grid point nor repetition, in the order of results.csv."""
-    held = find_repeats(data)
-    names = dict.fromkeys(name for world, name, _ in data.cases if world == scenario and (world, name) not in held)
-    points = grid_points(data)
-    return [name for name in names if (scenario, name) not in points]
+    return list(_name_variants(data).get(scenario, ()))
+
+
+@lru_cache(maxsize=_RUNS)
+def _name_variants(data: RunData) -> dict[str, dict[str, None]]:
+    held, points, found = find_repeats(data), grid_points(data), dict[str, dict[str, None]]()
+    for world, name, _ in data.cases:
+        if (world, name) not in held and (world, name) not in points:
+            found.setdefault(world, {})[name] = None
+    return found
 
 
 def pictured_variants(data: RunData, scenario: str) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import pandas as pd
 
@@ -52,6 +53,7 @@ def find_grids(data: RunData) -> list[GridOf]:
     return result
 
 
+@lru_cache(maxsize=8)
 def grid_points(data: RunData) -> set[tuple[str, str]]:
     """Return the scenario and the variant of every point of a grid."""
     return {(grid.scenario, name) for grid in find_grids(data) for name in grid.points.values()}

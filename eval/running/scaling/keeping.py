@@ -129,10 +129,12 @@ def list_dropped(run: RunFolder) -> list[Path]:
     return [path for path in every if not (run.path / "pairs" / path.parent.name / path.stem).is_dir()]
 
 
-def is_dropped(run: RunFolder, world: str, seed: int, scenario: Mapping[str, Any], files: Mapping[str, str]) -> bool:
-    """Tell whether the removed sessions of a pair were made from this scenario and these files."""
+def is_dropped(
+    run: RunFolder, world: str, seed: int, scenario: Mapping[str, Any], files: Mapping[str, str]
+) -> bool | None:
+    """Tell whether the removed sessions of a pair were made from this scenario and these files; None without them."""
     record = None if run.pair(world, seed).exists() else read_dropped(dropped_file(run, world, seed))
-    return record is not None and digest(record.scenario) == digest(scenario) and record.files == files
+    return None if record is None else digest(record.scenario) == digest(scenario) and record.files == files
 
 
 def _remove_answers(run: RunFolder, world: str, seed: int) -> None:

@@ -23,7 +23,7 @@ from eval.core.output import copy_folder, new_folder
 from eval.core.provenance import digest, now
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.plans.cells import list_planned_cases
-from eval.plans.coverage import read_stored_plan
+from eval.plans.coverage import explain_unreadable_plan, read_stored_plan
 from eval.running.cell_rows import ITEM_TABLES, SURFACE_TABLES
 from eval.running.runfolder import RunFolder, open_run_folder, write_json, write_tables
 from eval.running.scaling.keeping import read_dropped
@@ -294,9 +294,11 @@ def _link_or_copy(source: str | Path, target: str | Path) -> None:
 
 def _missing(run: RunFolder, told: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return one sentence for the shards that are missing, and one for pairs that are not finished."""
-    plan = read_stored_plan(run.provenance())
+    provenance = run.provenance()
+    plan = read_stored_plan(provenance)
     if plan is None:
-        return []
+        mistake = explain_unreadable_plan(provenance)
+        return [f"what is missing cannot be told, as the plan cannot be read here: {mistake}"] if mistake else []
     planned = list_planned_cases(plan)
     done = {tuple(cell["row"][name] for name in ("scenario", "seed", "variant")) for cell in run.each_cell()}
     lacking = {case[:2] for case in planned if case not in done}

@@ -88,30 +88,42 @@ class Mirror:
         self._get(folder, [*names, "provenance.json"], progress or Silent())
 
     def forget(self, run: RunFolder, pairs: Iterable[Pair]) -> None:
-        """Remove cells that are about to run again, so that no later run takes the old ones.
+        """Remove cells of pairs that run which the folder lacks, so that no later run takes the old ones.
+
+        They were taken before (`fetch`): what is gone since is about to run again, or is about another world.
 
         Raises:
             InputError: They cannot be removed.
         """
-        stored = set(self._list("cells"))
-        todo = ((pair, each.cell.variant) for pair in pairs for each in pair.todo)
-        names = (_relative(run, run.cell(pair.name, pair.seed, variant)) for pair, variant in todo)
+        running = {_relative(run, run.cell(pair.name, pair.seed, "any").parent) for pair in pairs if pair.todo}
         with self._told():
-            for name in names:
-                if name in stored:
+            for name in self._list("cells"):
+                if name.rpartition("/")[0] in running and not (run.path / name).exists():
                     self._fs.rm_file(self._place(name))
 
     def copy_pair(self, run: RunFolder, pair: Pair) -> None:
-        """Copy the answers of a pair's cells, and then the cells, whose files say that they are finished.
+        """Copy the answers of the cells of a pair that ran, and then the cells, whose files say that they are finished.
 
         Raises:
             InputError: The place cannot be written.
         """
         for each in pair.todo:
-            names = pair.name, pair.seed, each.cell.variant
-            answer = run.answer(*names)
-            found = [answer / name for name in _ANSWER if (answer / name).is_file()]
-            self._put(run, [*found, run.cell(*names)])
+            self._copy_cell(run, run.cell(pair.name, pair.seed, each.cell.variant))
+
+    def copy_missing(self, run: RunFolder) -> None:
+        """Copy the finished cells that are not there: of an interrupted pair, or of a run that began without a copy.
+
+        Raises:
+            InputError: The place cannot be written.
+        """
+        stored = set(self._list("cells"))
+        for cell in sorted(run.path.glob("cells/*/*/*.json")):
+            if _relative(run, cell) not in stored:
+                self._copy_cell(run, cell)
+
+    def _copy_cell(self, run: RunFolder, cell: Path) -> None:
+        answer = run.path / "answers" / cell.relative_to(run.path / "cells").with_suffix("")
+        self._put(run, [*(answer / name for name in _ANSWER if (answer / name).is_file()), cell])
 
     def copy_tables(self, run: RunFolder) -> None:
         """Copy provenance and tables.
@@ -149,7 +161,7 @@ class Mirror:
         with self._told():
             place = self._place(folder)
             found = self._fs.find(place) if self._fs.exists(place) else []
-            return sorted(str(name).rpartition(f"{self._root}/")[2] for name in found)
+            return sorted(str(name).removeprefix(f"{self._root}/") for name in found)
 
     def _place(self, name: str) -> str:
         return f"{self._root}/{name}"

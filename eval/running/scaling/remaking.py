@@ -17,6 +17,7 @@ from eval.running.runfolder import RunFolder
 from eval.running.scaling.keeping import Dropped, dropped_file, read_dropped, remove_pair, require_same_bytes
 from eval.running.stages.pair_stages import PairStages
 from eval.truth.adapters import pipeline_input
+from scenarios.grafted import GraftScenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
 
@@ -126,7 +127,8 @@ def remade_below(
 
 
 def _read_scenario(source: Path, record: Dropped) -> Scenario:
-    scenario = validate(Scenario, Document(str(source), dict(record.scenario)))
+    model = GraftScenario if "recording" in record.scenario else Scenario
+    scenario = validate(model, Document(str(source), dict(record.scenario)))
     found = file_digests(scenario)
     if changed := [name for name in found if record.files.get(name) != found[name]]:
         raise InputError(

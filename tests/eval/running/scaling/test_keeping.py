@@ -3,7 +3,8 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -136,6 +137,26 @@ def test_more_cells_of_a_removed_pair_are_of_the_same_sessions(kept: RunFolder, 
         runner.run(kept.path, more, shard=Shard(1, 3), keep="answers")
     # forced, all of its cells are of the new sessions
     assert runner.run(kept.path, more, shard=Shard(1, 3), keep="answers", force=True)[1].n_done == 6
+
+
+def test_rows_about_another_world_go_though_its_sessions_are_gone(kept: RunFolder, runner: Runner, plan: Plan) -> None:
+    def draw(name: str, seed: int, settings: Iterable[str] = ()) -> Scenario:
+        return load_small(name, seed, settings).model_copy(update={"description": "another world"})
+
+    one = plan.model_copy(update={"variants": plan.variants[:1]})
+    runner.run(kept.path, one, shard=Shard(1, 3), keep="answers", tools=replace(runner.tools, draw=draw))
+    assert {cell["row"]["variant"] for cell in kept.each_cell()} == {VARIANT}
+    assert len(list(kept.path.glob("answers/*/*/*"))) == 2
+
+
+def test_a_grafted_pair_is_read_as_one(kept: RunFolder) -> None:
+    place = list_dropped(kept)[0]
+    record = json.loads(place.read_text())
+    scenario = {name: value for name, value in record["scenario"].items() if name in ("family", "description", "props")}
+    place.write_text(json.dumps(record | {"scenario": {**scenario, "recording": {"sessions": ["drive.bag"]}}}))
+    with pytest.raises(InputError) as caught:
+        remake_pair(kept, *FIRST)
+    assert "recording: unknown key" not in str(caught.value) and "tunnel: missing" not in str(caught.value)
 
 
 def test_an_interrupted_run_keeps_the_pair_in_work_and_drops_it_later(

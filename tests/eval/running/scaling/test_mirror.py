@@ -1,18 +1,21 @@
 """Rows and answers at a URL: the local and the memory file system."""
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from cdpipe.core.errors import InputError
 from eval.plans.plan import Plan
-from eval.running.runfolder import RunFolder
+from eval.running.runfolder import RunFolder, write_json
 from eval.running.scaling.mirror import Mirror
 from eval.running.scaling.shards import Shard
-from tests.eval.running.scaling.conftest import Runner
+from scenarios.schema import Scenario
+from tests.eval.running.scaling.conftest import Runner, load_small
 from tests.same_numbers import differences
 
 Command = Callable[..., tuple[int, str, str]]
@@ -56,6 +59,68 @@ def test_forced_cells_are_forgotten_there_first(tmp_path: Path, runner: Runner, 
 class Stopped(Mirror):
     def copy_pair(self, *_: object) -> None:
         raise KeyboardInterrupt
+
+
+def cells_of(folder: Path) -> list[str]:
+    return sorted(path.relative_to(folder).as_posix() for path in folder.glob("cells/*/*/*.json"))
+
+
+def test_cells_that_were_finished_without_a_copy_are_copied_later(tmp_path: Path, runner: Runner, plan: Plan) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        runner.run(tmp_path / "a", plan, shard=PART, mirror=Stopped(f"file://{tmp_path}/far"))
+    run, outcome = runner.run(tmp_path / "a", plan, shard=PART, mirror=Mirror(f"file://{tmp_path}/far"))
+    assert outcome.n_kept > 0 and cells_of(tmp_path / "far") == cells_of(run.path)
+    runner.run(tmp_path / "a", plan, shard=PART, mirror=Mirror(f"file://{tmp_path}/later"))
+    assert cells_of(tmp_path / "later") == cells_of(run.path)
+    Mirror(f"file://{tmp_path}/later").fetch_all(tmp_path / "c")
+    assert len(list((tmp_path / "c").glob("answers/*/*/*/answer.json"))) == len(cells_of(run.path))
+
+
+def test_rows_about_another_world_do_not_come_back_from_the_copy(tmp_path: Path, runner: Runner, plan: Plan) -> None:
+    url = f"file://{tmp_path}/far"
+    runner.run(tmp_path / "a", plan, shard=PART, mirror=Mirror(url))
+    one = plan.model_copy(update={"variants": plan.variants[:1]})
+    tools = replace(runner.tools, draw=load_other)
+    for _ in range(2):
+        run, _ = runner.run(tmp_path / "a", one, shard=PART, mirror=Mirror(url), tools=tools)
+        assert len(pd.read_csv(run.path / "results.csv")) == len(cells_of(tmp_path / "far")) == 2
+
+
+def load_other(name: str, seed: int, settings: Iterable[str] = ()) -> Scenario:
+    return load_small(name, seed, settings).model_copy(update={"description": "another world"})
+
+
+def test_an_interrupted_fetch_leaves_a_run_folder(
+    tmp_path: Path, runner: Runner, plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = f"file://{tmp_path}/far"
+    runner.run(tmp_path / "a", plan, shard=PART, mirror=Mirror(url))
+
+    def stop(mirror: Mirror, folder: Path, names: list[str], _: object) -> None:
+        (folder / names[0]).parent.mkdir(parents=True)
+        shutil.copyfile(mirror._place(names[0]), folder / names[0])
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(Mirror, "_get", stop)
+        runner.run(tmp_path / "b", plan, shard=PART, mirror=Mirror(url))
+    assert runner.run(tmp_path / "b", plan, shard=PART, mirror=Mirror(url))[1].n_done == 0
+
+
+def test_cells_of_a_copy_made_by_other_packages_are_not_gone_on_with(
+    tmp_path: Path, runner: Runner, plan: Plan
+) -> None:
+    run, _ = runner.run(tmp_path / "a", plan, shard=PART, limit=1, mirror=Mirror(f"file://{tmp_path}/far"))
+    told = run.provenance()
+    write_json(tmp_path / "far" / "provenance.json", {**told, "versions": {**told["versions"], "numpy": "1.0"}})
+    with pytest.raises(InputError, match="far: its finished cells and the others: of different"):
+        runner.run(tmp_path / "b", plan, shard=PART, mirror=Mirror(f"file://{tmp_path}/far"))
+
+
+def test_a_place_may_have_the_name_of_a_world(tmp_path: Path, runner: Runner, plan: Plan) -> None:
+    run, _ = runner.run(tmp_path / "a", plan, shard=PART, mirror=Mirror("memory://smoke__one_box"))
+    assert Mirror("memory://smoke__one_box")._list("cells") == cells_of(run.path)
+    MemoryFileSystem.store.clear()
 
 
 def test_merge_runs_takes_urls(

@@ -241,3 +241,17 @@ def test_the_record_of_a_call_is_of_the_run_that_gives_its_answer(tmp_path: Path
     merge_runs(copies, tmp_path / "run", keep="answers")
     call = tmp_path / "run" / "evaluations" / method / world / f"{seed}.json"
     assert json.loads(call.read_text()) == {"error": "first"}
+
+
+def test_a_plan_that_cannot_be_read_here_is_told_and_keeps_its_tables(tmp_path: Path, shards: Sequence[Path]) -> None:
+    copies = [shutil.copytree(shard, tmp_path / shard.name) for shard in shards[:2]]
+    for copy in copies:
+        told = json.loads((copy / "provenance.json").read_text())
+        told["plan"]["variants"][0]["preset"] = "elsewhere.yaml"
+        (copy / "provenance.json").write_text(json.dumps(told))
+    (note,) = merge_runs(copies, tmp_path / "run", keep="answers").notes
+    assert note.startswith("what is missing cannot be told, as the plan cannot be read here: ")
+    assert "elsewhere.yaml" in note
+    (tmp_path / "run" / "hard.csv").write_text("a\n1\n")  # of the place where the plan could be read
+    write_tables(RunFolder(tmp_path / "run"))
+    assert (tmp_path / "run" / "hard.csv").is_file()
