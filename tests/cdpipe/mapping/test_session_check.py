@@ -126,6 +126,12 @@ def test_z_is_up() -> None:
     assert "90 degrees" in said(climbing)
 
 
+def test_a_standing_sensor_with_odometry_that_jitters_up_and_down_passes() -> None:
+    standing = Drive(60, trajectory=0.0)
+    standing.odom_T_sensor[:, :3, 3] += stream(0, "jitter").normal(0, (0.02, 0.02, 0.06), (60, 3))
+    check_session(standing, MapConfig())
+
+
 def test_a_steep_ramp_passes() -> None:
     ramp = Drive()
     ramp.odom_T_sensor[:, 2, 3] = 0.4 * ramp.odom_T_sensor[:, 0, 3]

@@ -45,6 +45,21 @@ def test_a_lifted_floor_fits_up_to_the_inlier_distance(
     assert fit.residual_m == pytest.approx(lift_m, abs=1e-9)
 
 
+def test_what_does_not_fit_holds_nothing(tunnel_before: MappedSession) -> None:
+    """A wall across the axis, which lies elsewhere in the other session."""
+    across, up = (grid.ravel() for grid in np.meshgrid(np.arange(-3, 3, 0.1), np.arange(0.3, 3, 0.1)))
+    maps = []
+    for along_m in (3.0, 3.0, 3.3):
+        points = np.concatenate([floor(), np.column_stack([np.full(len(up), along_m), across, up])])
+        maps.append(
+            replace(tunnel_before.map, points=points, nearest_m=np.ones(len(points), np.float32), seen_from=None)
+        )
+    target = IndexedMap(maps[0], CONFIG, is_target=True)
+    held, moved = (fit_at((target, IndexedMap(each, CONFIG, is_target=False)), np.eye(4)) for each in maps[1:])
+    assert held.information[3, 3] > 20
+    assert moved.information[3, 3] < 0.05 * held.information[3, 3]
+
+
 def test_distances_are_along_the_normal_and_not_to_the_next_point(floors: tuple[IndexedMap, IndexedMap]) -> None:
     # points of the second map lie a decimetre and more from the nearest of the first, but on its surface
     fit = fit_at(floors, make_pose(translation=(0.1, -0.05, 0.0)))

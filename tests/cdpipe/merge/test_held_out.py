@@ -25,7 +25,7 @@ class Judge:
         return make_pose(translation=(0.0, off_m, 0.0)) @ self.true
 
     def choose(
-        self, refined_off_m: Float64Array, rigid_off_m: float, within_m: float = np.inf, every: int = 5
+        self, refined_off_m: Float64Array, rigid_off_m: float | Float64Array, within_m: float = np.inf, every: int = 5
     ) -> tuple[Float64Array | None, dict[str, float]]:
         """Return how far the choice is off at each keyframe (K,), None where it is the rigid one, and the evidence."""
         refined = np.array([self.pose(off_m) for off_m in refined_off_m])
@@ -36,7 +36,7 @@ class Judge:
             self.after.odom_T_keyframe,
             self.places,
             refined,
-            self.pose(rigid_off_m),
+            self.pose(rigid_off_m) if isinstance(rigid_off_m, float) else np.array([*map(self.pose, rigid_off_m)]),
             RADIUS_M,
             within_m,
         )
@@ -63,6 +63,14 @@ def test_each_place_has_the_alignment_that_fits_and_there_is_no_step_between(jud
     assert evidence["n_judged"] == len(judge.places)
     assert abs(evidence["n_kept"] - len(judge.places) / 2) <= 1
     assert 0 < evidence["rigid_misfit"] < evidence["refined_misfit"] < 1
+
+
+def test_a_merge_that_bends_is_kept_place_by_place(judge: Judge) -> None:
+    half, given_m = judge.n // 2, np.linspace(0.05, 0.25, judge.n)
+    off_m, _ = judge.choose(np.where(np.arange(judge.n) < half, 0.0, 0.6), given_m)
+    assert off_m is not None
+    np.testing.assert_allclose(off_m[: half - 2 * SPACING], 0.0, atol=1e-9)
+    np.testing.assert_allclose(off_m[half + 2 * SPACING :], given_m[half + 2 * SPACING :], atol=1e-9)
 
 
 def test_a_place_and_its_neighbours_decide_together() -> None:

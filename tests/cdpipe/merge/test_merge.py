@@ -353,14 +353,20 @@ def test_no_gate_is_asked_about_a_known_merge(tunnel_before: MappedSession, othe
     assert merged.is_accepted and merged.evidence == {"n_hypotheses": 0.0, "is_known": 1.0}
 
 
-def stand(along_m: float, sample: int, odom_T_world: Float64Array, n_scans: int = 5) -> MappedSession:
-    """A sensor that stands in the tunnel at `along_m` and sees 6000 of the points within 12 m in each scan."""
+def stand(
+    along_m: float, sample: int, odom_T_world: Float64Array, n_scans: int = 5, jitter_m: float = 0.0
+) -> MappedSession:
+    """A sensor that stands in the tunnel at `along_m` and sees 6000 of the points within 12 m in each scan.
+
+    Its odometry says that it jumps to and fro by `jitter_m`.
+    """
     rng = stream(sample, "standing")
     points = tunnel_points(0, sample)
     world_T_sensor = yaw_pose(rng.uniform(-1, 1), (along_m, bend(np.array(along_m), 0), 1.5))
     near = points[np.linalg.norm(points - world_T_sensor[:3, 3], axis=1) < 12.0]
     clouds = [transform(invert(world_T_sensor), rng.choice(near, 6000, replace=False)) for _ in range(n_scans)]
     poses = np.repeat((odom_T_world @ world_T_sensor)[None], n_scans, axis=0)
+    poses[1::2, 0, 3] += jitter_m
     return mapped(CloudScans("standing", poses, clouds), odom_T_world)
 
 
@@ -378,6 +384,16 @@ def test_a_standing_sensor_is_merged_by_what_there_is(n_scans: int) -> None:
     assert path_error_m(take_known_merge(before, after, off, CONFIG), true) < 0.02
     as_it_is = take_known_merge(before, after, off, CONFIG.model_copy(update={"refine": "none"}))
     np.testing.assert_array_equal(as_it_is.before_T_after, off)
+
+
+def test_a_standing_sensor_with_jittering_odometry_is_judged_as_one_place() -> None:
+    before, after = (stand(30.0, sample, np.eye(4), n_scans=12, jitter_m=0.5) for sample in (0, 1))
+    assert len(before.map.keyframe_scans) > 3
+    merged = merge_maps(before, after, CONFIG)
+    assert "both_ways_m" in merged.evidence
+    assert (
+        "record a path of ten metres or more" in merge_maps(before, stand(44.0, 1, np.eye(4), 12, 0.5), CONFIG).reason
+    )
 
 
 def test_a_short_recording_of_single_rings_is_refused_and_a_known_merge_of_it_stays(

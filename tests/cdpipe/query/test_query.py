@@ -254,8 +254,9 @@ def test_between_the_stations_of_a_survey_it_is_asked_at_the_keyframes_of_the_ro
     paper = find_regions(merged, STATIONS[1], DRIVE[1], by("scan", reading="paired", suppression=1e-9))
     of_drive = sorted(paper.centres_map[paper.direction == 1][:, 0].tolist())
     assert of_drive == [x for x in range(31) if x % 10 != 5 and x < 25]
-    # the other way round the stations are the after session, and two drives have no gaps
-    for before, after in ((DRIVE, STATIONS), (DRIVE, DRIVE)):
+    # the other way round the stations are the after session; two drives, or two surveys, have no gaps
+    longer = session([(1.003 * x, 0, 0) for x in (0.0, 10.0, 20.0)], [[1, 0]] * 3)
+    for before, after in ((DRIVE, STATIONS), (DRIVE, DRIVE), (longer, STATIONS), (STATIONS, longer)):
         merged = MergedMaps(before[0], after[0], make_pose(), {}, True)
         found = find_regions(merged, before[1], after[1], by("every-keyframe", suppression=1e-9))
         assert found.direction is not None and (found.direction == 0).all()

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.mapping.poses.consistency import make_consistent
-from cdpipe.mapping.poses.loops import Loop, close_loops, find_loops
+from cdpipe.mapping.poses.loops import Loop, _find_candidates, close_loops, find_loops
 from cdpipe.mapping.poses.scan_registration import Samples
 from tests.cdpipe.conftest import CloudScans
 
@@ -111,6 +111,17 @@ def test_a_hall_without_a_point_near_the_path_closes_nothing() -> None:
     off = true.copy()
     off[:, 1, 3] = np.linspace(0, 1.5, 60)
     assert find_loops(Samples(CloudScans("hall", off, clouds)), off) == ()
+
+
+def test_the_candidates_of_many_passes_grow_with_the_path() -> None:
+    counts = []
+    for n_passes in (10, 20):
+        along_m = np.abs((np.arange(60.0 * n_passes) + 60) % 120 - 60)  # to and fro
+        poses = np.array([yaw_pose(0.0, (x, 0.0, 0.0)) for x in along_m])
+        found = _find_candidates(np.arange(len(poses), dtype=np.float64), poses)
+        assert {scan - other >= 25 for scan, other in found} == {True}
+        counts.append(len(found))
+    assert counts[1] < 2.6 * counts[0]
 
 
 def test_the_pose_graph_shares_an_error_out_over_the_round() -> None:
