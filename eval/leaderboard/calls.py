@@ -1,8 +1,10 @@
 """What is kept of the calls of an evaluated command, beside its rows.
 
-RUN/evaluations/<method>/evaluation.json        command, merge, time limit, plan; digests of the programs' files
-RUN/evaluations/<method>/<world>/<seed>.json    how the call ended: seconds, error, end of its standard error;
-digests of the pair, of what was called and of what it answered
+    RUN/evaluations/<method>/evaluation.json        command, merge, time limit, plan; digests of the programs' files
+    RUN/evaluations/<method>/<world>/<seed>.json    how the call ended: seconds, error, end of its standard error;
+                                                    digests of the pair, of what was called and of what it answered
+
+Answers and rows lie where those of the other variants of a run do.
 """
 
 from __future__ import annotations

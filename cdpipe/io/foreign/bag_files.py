@@ -62,7 +62,7 @@ def read_stamps(path: str, topic: str) -> Iterator[Message]:
             stamps.append(_nanoseconds(message.header.stamp))
             points = _cloud(message)["points"]
             has_returns.append(bool((np.isfinite(points).all(axis=1) & points.any(axis=1)).any()))
-    about = {"frames": sorted(frames)[:_MOST_FRAMES]}
+    about = {"frames": sorted(frames - {""})[:_MOST_FRAMES]}
     yield about, {"stamps": np.array(stamps, np.int64), "has_returns": np.array(has_returns, np.uint8)}
 
 

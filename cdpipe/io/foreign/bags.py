@@ -178,7 +178,7 @@ class BagScans:
     def _require_one_frame(self, frames: Sequence[str]) -> str:
         """Return the frame of the clouds, "" where they name none; refuse those of several sensors on one topic."""
         if len(frames) > 1:
-            told = ", ".join(visible(frame) or "no name" for frame in frames)
+            told = ", ".join(map(visible, frames))
             raise InputError(
                 f"{self._path}: {self._topic}: its clouds are of several frames ({told}), and so of several sensors: "
                 "record one topic for each"
@@ -302,18 +302,16 @@ def _chain(edges: dict[str, _Edge], frame: str, top: str = "") -> list[_Edge]:
 
 def _mounting(edges: dict[str, _Edge], base: str, frame: str) -> list[_Edge]:
     """Return the edges that lead from a base to a frame of the same robot; empty where tf tells of no such way."""
-    below = _chain(edges, frame, base)
-    if below:
-        return below
-    above = [base]
-    for edge in _climb(edges, base):
-        above.append(edge.parent)
-        if above[-1] in _NO_SENSOR:
+    way = _chain(edges, frame, base)
+    up: list[_Edge] = []
+    for edge in _climb(edges, base) if not way else ():
+        if edge.parent in _NO_SENSOR:
             return []
-        if above[-1] == frame or (below := _chain(edges, frame, above[-1])):
-            up = _climb(edges, base)[: len(above) - 1]
-            return [_Edge(name, each.time_s, invert(each.poses)) for name, each in zip(above, up, strict=False)] + below
-    return []
+        up.append(replace(edge, poses=invert(edge.poses)))
+        way = _chain(edges, frame, edge.parent)
+        if way or edge.parent == frame:
+            return up + way
+    return way
 
 
 def _climb(edges: dict[str, _Edge], frame: str) -> list[_Edge]:
