@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.methods.whole_map import PlacedMaps, WholeMap
+from cdpipe.methods.whole_map import PlacedMaps, WholeMap, chosen_scans
 from cdpipe.model.config import ErasorConfig, PipelineConfig
 from cdpipe.model.types import SessionName
 
@@ -54,14 +54,18 @@ def erasor(maps: PlacedMaps, session: SessionName, other: SessionName, config: P
     """
     settings, point_map = config.erasor, maps.merged.map_of(other)
     points_odom = maps.merged.to_odom(other, maps.points[session])
-    positions = point_map.odom_T_sensor[:: settings.every_scan, :3, 3]
+    scans = chosen_scans(point_map.odom_T_sensor, settings.every_scan)
+    positions = point_map.odom_T_sensor[scans, :3, 3]
     floors_m = _floor_heights(positions, point_map.points)
     is_new = np.zeros(len(points_odom), dtype=np.bool_)
-    for number, (position, floor_m) in enumerate(zip(positions, floors_m, strict=True)):
-        scan = number * settings.every_scan
+    if not len(points_odom):
+        return is_new
+    plan = cKDTree(points_odom[:, :2])
+    for scan, position, floor_m in zip(scans.tolist(), positions, floors_m, strict=True):
+        near = np.sort(plan.query_ball_point(position[:2], settings.max_range_m * (1 + 1e-6))).astype(np.int64)
         hit = np.unique(point_map.return_points[slice(*point_map.scan_offsets[scan : scan + 2])])
         origin = np.array([position[0], position[1], floor_m])
-        is_new |= flat_column_mask(points_odom - origin, point_map.points[hit] - origin, settings)
+        is_new[near] |= flat_column_mask(points_odom[near] - origin, point_map.points[hit] - origin, settings)
     return is_new
 
 

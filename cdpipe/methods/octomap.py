@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from cdpipe.core.geometry import BoolArray
+from cdpipe.core.geometry import BoolArray, Float64Array
 from cdpipe.core.geometry.voxel import thin
 from cdpipe.methods.whole_map import PlacedMaps, WholeMap
 from cdpipe.model.config import PipelineConfig
@@ -21,6 +21,8 @@ from cdpipe.model.types import SessionName
 
 # What pyoctomap calls a voxel that was met and is less probable than the limit.
 _FREE = 0
+# Paths beyond this get an origin of their own.
+_FAR_M = 1000.0
 
 
 @WholeMap
@@ -44,11 +46,19 @@ def octomap(maps: PlacedMaps, session: SessionName, other: SessionName, config: 
     settings = config.octomap
     tree = load_pyoctomap().OcTree(settings.voxel_m)
     tree.setOccupancyThres(settings.free_below)
+    origin = _near_origin(maps.merged.map_of(other).odom_T_sensor[:, :3, 3], settings.voxel_m)
     for odom_T_sensor, returns_odom in maps.scans(other, settings.every_scan):
-        tree.insertPointCloud(thin(returns_odom, settings.voxel_m), odom_T_sensor[:3, 3].copy(), lazy_eval=True)
+        position = odom_T_sensor[:3, 3] - origin
+        tree.insertPointCloud(thin(returns_odom - origin, settings.voxel_m), position, lazy_eval=True)
     is_free = np.zeros(len(maps.points[session]), dtype=np.bool_)
-    is_free[compared] = tree.getLabels(points_odom) == _FREE
+    is_free[compared] = tree.getLabels(points_odom - origin) == _FREE
     return is_free
+
+
+def _near_origin(path: Float64Array, voxel_m: float) -> Float64Array:
+    """Return an origin (3,) on the grid near a (S, 3) path, because voxels have numbers of 16 bits; 0 within 1 km."""
+    centre = path.mean(axis=0) if len(path) else np.zeros(3)
+    return np.asarray(np.round(centre / voxel_m) * voxel_m if np.linalg.norm(centre) > _FAR_M else np.zeros(3))
 
 
 def load_pyoctomap() -> Any:

@@ -23,6 +23,8 @@ from cdpipe.query.difference import marked_share
 from cdpipe.query.drift_width import LEAST_RADIUS_M, keyframe_radii
 from cdpipe.query.query import query_nearest, rank_regions, score_keyframes_by_share
 
+_STATION_M = 3.0
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedMaps:
@@ -57,11 +59,21 @@ class PlacedMaps:
         return compared, self.merged.to_odom(other, self.points[session][compared])
 
     def scans(self, session: SessionName, every_scan: int) -> Iterator[tuple[Float64Array, Float64Array]]:
-        """Return the (4, 4) odom_T_sensor and the (R, 3) returns, odom frame, of every n-th scan of a session."""
+        """Return the (4, 4) odom_T_sensor and the (R, 3) returns, odom frame, of the `chosen_scans` of a session."""
         point_map = self.merged.map_of(session)
-        for scan in range(0, len(point_map.odom_T_sensor), every_scan):
+        for scan in chosen_scans(point_map.odom_T_sensor, every_scan).tolist():
             returns = np.arange(*point_map.scan_offsets[scan : scan + 2])
             yield point_map.odom_T_sensor[scan], point_map.positions_of(returns)
+
+
+def chosen_scans(odom_T_sensor: Float64Array, every_scan: int) -> Int64Array:
+    """Return every n-th of (S, 4, 4) scans, and each that lies more than 3 m from its neighbours.
+
+    A drive at 10 Hz sees a place in many scans; a station of a survey is the only scan of its place.
+    """
+    is_far = np.linalg.norm(np.diff(odom_T_sensor[:, :3, 3], axis=0), axis=1) > _STATION_M
+    is_station = np.append(True, is_far) & np.append(is_far, True)
+    return np.flatnonzero((np.arange(len(odom_T_sensor)) % every_scan == 0) | is_station)
 
 
 NewMask = Callable[[PlacedMaps, SessionName, SessionName, PipelineConfig], BoolArray]

@@ -43,7 +43,7 @@ class DufomapConfig(Settings):
 
     voxel_m: Cell = Field(0.1, description="`dufomap`: voxel of the void map")
     hit_inflation_m: NonNegative = Field(0.2, description="`dufomap`: not void within this distance of a return (d_s)")
-    every_scan: Count = Field(1, description="`dufomap`: the rays of every n-th scan are cast")
+    every_scan: Count = Field(1, description="`dufomap`: the rays of every n-th scan are cast, and of stations")
 
 
 class RemovertConfig(Settings):
@@ -55,7 +55,7 @@ class RemovertConfig(Settings):
     margin: Share = Field(
         0.05, description="`removert`: a scan sees through a point if it is farther by this share of the point's range"
     )
-    every_scan: Count = Field(1, description="`removert`: every n-th scan is compared")
+    every_scan: Count = Field(1, description="`removert`: every n-th scan is compared, and stations")
 
 
 class OctomapConfig(Settings):
@@ -63,7 +63,7 @@ class OctomapConfig(Settings):
 
     voxel_m: Cell = Field(0.1, description="`octomap`: voxel of the occupancy map")
     free_below: Share = Field(0.5, description="`octomap`: a voxel is free if its probability is lower")
-    every_scan: Count = Field(1, description="`octomap`: the rays of every n-th scan are cast")
+    every_scan: Count = Field(1, description="`octomap`: the rays of every n-th scan are cast, and of stations")
 
 
 class M3C2EPConfig(Settings):
@@ -80,7 +80,7 @@ class ErasorConfig(Settings):
     max_range_m: Positive = Field(80.0, description="`erasor`: radius of the 20 rings of columns")
     max_height_m: Positive = Field(3.0, description="`erasor`: points higher above the floor are not used")
     scan_ratio: Share = Field(0.2, description="`erasor`: a column is flat if it is lower than this share of the map's")
-    every_scan: Count = Field(1, description="`erasor`: every n-th scan is compared")
+    every_scan: Count = Field(1, description="`erasor`: every n-th scan is compared, and stations")
 
 
 class RangeNetConfig(GrownSettings):

@@ -3,11 +3,12 @@
 import importlib.util
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from cdpipe.core.geometry import Float64Array, stream, transform, yaw_pose
+from cdpipe.core.geometry import Float64Array, make_pose, stream, transform, yaw_pose
 from cdpipe.methods.dufomap import dufomap
 from cdpipe.methods.m3c2 import Distances, m3c2
 from cdpipe.methods.m3c2_ep import detection_levels, m3c2_ep
@@ -242,12 +243,16 @@ def test_octomap_by_hand(empty: PointMap) -> None:
     points = np.column_stack([x_m, np.full(len(x_m), 0.05), np.full(len(x_m), 1.55)])
     sessions = merged(empty, empty, np.eye(4))
     maps, short = (placed(points, points, np.zeros((1, 3)), sessions, radius_m) for radius_m in (9.0, 1.0))
+    away = np.array([20_000.0, 0.0, 0.0])  # beyond what 16 bits of voxels reach
+    moved = replace(empty, points=empty.points + away, odom_T_sensor=make_pose(translation=away) @ empty.odom_T_sensor)
+    far = placed(points + away, points + away, away[None], merged(moved, moved, np.eye(4)), 9.0)
 
     def is_free(session: SessionName, other: SessionName, maps: PlacedMaps = maps) -> list[bool]:
         config = load_config("octomap", ["octomap.voxel_m=0.1", "octomap.free_below=0.3", "octomap.every_scan=1"])
         return octomap.new_mask(maps, session, other, config).tolist()
 
     assert is_free("after", "before") == is_free("before", "after") == [True, True, True, False, False]
+    assert is_free("after", "before", far) == [True, True, True, False, False]
     assert not any(is_free("after", "before", maps=short))
 
 

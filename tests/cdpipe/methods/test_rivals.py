@@ -1,17 +1,18 @@
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import BoolArray, Float64Array, transform, yaw_pose
+from cdpipe.core.geometry import BoolArray, Float64Array, make_pose, transform, yaw_pose
 from cdpipe.core.plugins import METHODS, entry_points
 from cdpipe.methods.c2c import c2c
 from cdpipe.methods.random_regions import RandomRegions
 from cdpipe.methods.registry import list_extras, load_method
 from cdpipe.methods.voxel_diff import voxel_diff
-from cdpipe.methods.whole_map import PlacedMaps, WholeMap
+from cdpipe.methods.whole_map import PlacedMaps, WholeMap, chosen_scans
 from cdpipe.model.config import PipelineConfig, load_config, preset_names
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, SessionName
@@ -288,3 +289,21 @@ def test_points_are_compared_within_the_radius_of_the_others_nearest_keyframe() 
     assert maps.is_compared("after", "before").tolist() == [True, False, True, False, False, True]
     nowhere = replace(maps, path={"before": path[:0], "after": path}, radii_m={"before": radii_m[:0], "after": radii_m})
     assert not nowhere.is_compared("after", "before").any()
+
+
+def test_stations_of_a_survey_are_never_left_out() -> None:
+    def along(step_m: float, n: int) -> Float64Array:
+        return np.array([make_pose(translation=(step_m * k, 0.0, 0.0)) for k in range(n)])
+
+    assert chosen_scans(along(10.0, 16), 8).tolist() == list(range(16))
+    assert chosen_scans(along(0.1, 316), 8).tolist() == list(range(0, 316, 8))
+    assert chosen_scans(along(0.1, 1), 8).tolist() == [0]
+
+
+@pytest.mark.parametrize("preset", ["frame", "kiss-matcher"])
+@pytest.mark.parametrize("site", ["narrow", "wide"])
+def test_presets_with_another_merge_differ_in_nothing_else(preset: str, site: Literal["narrow", "wide"]) -> None:
+    poses = ["map.consistency=none"] if preset == "frame" else []
+    ours = load_config("tunnelcd", poses, site=site).model_dump(exclude={"merge"})
+    theirs = load_config(preset, site=site).model_dump(exclude={"merge"})
+    assert theirs == ours

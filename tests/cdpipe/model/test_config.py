@@ -167,7 +167,7 @@ def test_a_preset_on_the_search_path_has_its_weights_beside_it(tmp_path: Path, m
 
 
 def test_settings_of_before_there_were_weights_and_frames_are_dumped_as_then() -> None:
-    dumped = load_config("frame").model_dump(mode="json")
+    dumped = load_config("paper").model_dump(mode="json")
     assert "sphere" not in dumped and "weights" not in dumped["descriptor"]
     dumped = load_config("tunnelcd", ["sphere.weights=a"]).model_dump(mode="json")
     assert dumped["sphere"] == {"frames": "path", "weights": "a"}
