@@ -66,7 +66,7 @@ def explain_unreadable_plan(provenance: Mapping[str, Any]) -> str:
 
 def _read(provenance: Mapping[str, Any]) -> tuple[Plan | None, str]:
     document = provenance.get("plan")
-    if not isinstance(document, dict):
+    if not isinstance(document, dict) or "scenarios" not in document:  # of a run that stored no plan
         return None, ""
     try:
         return validate(Plan, Document("provenance.json", document)), ""
