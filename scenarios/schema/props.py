@@ -67,7 +67,7 @@ class Shift(Settings):
 class Aged(Settings):
     """What time did to a prop that nobody touched: in the after session it stands a little otherwise; no change.
 
-    The pose of the before session is displaced as a whole; nothing settles again.
+    The pose of the before session is displaced as a whole; nothing settles again, or keeps it out of a wall.
     """
 
     shift_m: Annotated[float, Field(ge=0, le=0.2)] = 0.0
