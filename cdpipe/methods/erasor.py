@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
-from cdpipe.methods.whole_map import PlacedMaps, WholeMap, chosen_scans
+from cdpipe.methods.whole_map import PlacedMaps, WholeMap, choose_scans
 from cdpipe.model.config import ErasorConfig, PipelineConfig
 from cdpipe.model.types import SessionName
 
@@ -54,7 +54,7 @@ def erasor(maps: PlacedMaps, session: SessionName, other: SessionName, config: P
     """
     settings, point_map = config.erasor, maps.merged.map_of(other)
     points_odom = maps.merged.to_odom(other, maps.points[session])
-    scans = chosen_scans(point_map.odom_T_sensor, settings.every_scan)
+    scans = choose_scans(point_map.odom_T_sensor, settings.every_scan)
     positions = point_map.odom_T_sensor[scans, :3, 3]
     floors_m = _floor_heights(positions, point_map.points)
     is_new = np.zeros(len(points_odom), dtype=np.bool_)

@@ -59,14 +59,14 @@ class PlacedMaps:
         return compared, self.merged.to_odom(other, self.points[session][compared])
 
     def scans(self, session: SessionName, every_scan: int) -> Iterator[tuple[Float64Array, Float64Array]]:
-        """Return the (4, 4) odom_T_sensor and the (R, 3) returns, odom frame, of the `chosen_scans` of a session."""
+        """Return the (4, 4) odom_T_sensor and the (R, 3) returns, odom frame, of the `choose_scans` of a session."""
         point_map = self.merged.map_of(session)
-        for scan in chosen_scans(point_map.odom_T_sensor, every_scan).tolist():
+        for scan in choose_scans(point_map.odom_T_sensor, every_scan).tolist():
             returns = np.arange(*point_map.scan_offsets[scan : scan + 2])
             yield point_map.odom_T_sensor[scan], point_map.positions_of(returns)
 
 
-def chosen_scans(odom_T_sensor: Float64Array, every_scan: int) -> Int64Array:
+def choose_scans(odom_T_sensor: Float64Array, every_scan: int) -> Int64Array:
     """Return every n-th of (S, 4, 4) scans, and each that lies more than 3 m from its neighbours.
 
     A drive at 10 Hz sees a place in many scans; a station of a survey is the only scan of its place.

@@ -43,10 +43,9 @@ def measure_coverage(provenance: Mapping[str, Any], cases: Iterable[tuple[str, i
         provenance: Content of provenance.json.
         cases: Scenario, seed and variant of each row of results.csv.
     """
-    mistake = explain_unreadable_plan(provenance)
+    plan, mistake = _read(provenance)
     if mistake:
         return Coverage(0, 0, mistake)
-    plan = read_stored_plan(provenance)
     planned = set() if plan is None else list_planned_cases(plan)
     missing = planned - set(cases)
     pairs = {(scenario, seed) for scenario, seed, _ in planned}

@@ -264,7 +264,7 @@ def _remove_stale(run: RunFolder, pair: Pair, force: bool) -> None:
     """Remove what is about to run again, so that no table holds it if the run is interrupted."""
     if not pair.todo:
         return
-    if force or not (_is_simulated(run.pair(pair.name, pair.seed), pair) or _is_dropped(run, pair) is True):
+    if force or not (_is_simulated(run.pair(pair.name, pair.seed), pair) or _is_dropped(run, pair)):
         _remove_pair(run, pair)
         remove(dropped_file(run, pair.name, pair.seed))
     for each in pair.todo:

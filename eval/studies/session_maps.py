@@ -28,6 +28,7 @@ from cdpipe.io.session import read_session
 from cdpipe.mapping.mapping import build_map
 from cdpipe.mapping.movers import find_movers
 from cdpipe.methods.dufomap import UNKNOWN_VOXELS, load_dufomap, origin_pose
+from cdpipe.methods.whole_map import choose_scans
 from cdpipe.model.config import PipelineConfig, load_config
 from cdpipe.model.types import PointMap, ScanSource, SessionName
 from eval.core.terminal.exits import run_program
@@ -88,8 +89,9 @@ def _dufomap(point_map: PointMap, source: ScanSource, config: PipelineConfig) ->
     require_extra("dufomap", "the cleaning dufomap")
     settings = config.dufomap
     void_map = load_dufomap().dufomap(settings.voxel_m, settings.hit_inflation_m, UNKNOWN_VOXELS, THREADS)
+    chosen = set(choose_scans(point_map.odom_T_sensor, settings.every_scan).tolist())
     for scan in source.scans():
-        if scan.index % settings.every_scan == 0:
+        if scan.index in chosen:
             odom_T_sensor: Float64Array = point_map.odom_T_sensor[scan.index]
             void_map.run(transform(odom_T_sensor, scan.points_sensor), origin_pose(odom_T_sensor[:3, 3]), False)
     return np.asarray(void_map.segment(point_map.points, origin_pose(np.zeros(3)), False), dtype=np.bool_)

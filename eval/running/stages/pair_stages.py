@@ -21,7 +21,7 @@ import numpy as np
 
 from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.methods.registry import load_source
-from cdpipe.methods.whole_map import chosen_scans
+from cdpipe.methods.whole_map import choose_scans
 from cdpipe.model.config import MapConfig, PipelineConfig
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import MappedSession, PointMap, ScanSource
@@ -187,7 +187,7 @@ def kept_bytes(before: MappedSession, config: PipelineConfig, *, is_asked_after:
         kept = pose_bytes * n_keyframes + float(vectors.nbytes)
     elif source in _SCAN_READERS:
         every_scan = getattr(config, source).every_scan
-        read = chosen_scans(before.map.odom_T_sensor, every_scan)
+        read = choose_scans(before.map.odom_T_sensor, every_scan)
         kept = map_bytes + 12.0 * float(np.diff(before.map.scan_offsets)[read].sum())
     else:
         kept = map_bytes

@@ -12,7 +12,7 @@ from cdpipe.methods.c2c import c2c
 from cdpipe.methods.random_regions import RandomRegions
 from cdpipe.methods.registry import list_extras, load_method
 from cdpipe.methods.voxel_diff import voxel_diff
-from cdpipe.methods.whole_map import PlacedMaps, WholeMap, chosen_scans
+from cdpipe.methods.whole_map import PlacedMaps, WholeMap, choose_scans
 from cdpipe.model.config import PipelineConfig, load_config, preset_names
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, SessionName
@@ -295,9 +295,9 @@ def test_stations_of_a_survey_are_never_left_out() -> None:
     def along(step_m: float, n: int) -> Float64Array:
         return np.array([make_pose(translation=(step_m * k, 0.0, 0.0)) for k in range(n)])
 
-    assert chosen_scans(along(10.0, 16), 8).tolist() == list(range(16))
-    assert chosen_scans(along(0.1, 316), 8).tolist() == list(range(0, 316, 8))
-    assert chosen_scans(along(0.1, 1), 8).tolist() == [0]
+    assert choose_scans(along(10.0, 16), 8).tolist() == list(range(16))
+    assert choose_scans(along(0.1, 316), 8).tolist() == list(range(0, 316, 8))
+    assert choose_scans(along(0.1, 1), 8).tolist() == [0]
 
 
 @pytest.mark.parametrize("preset", ["frame", "kiss-matcher"])
