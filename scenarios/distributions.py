@@ -197,7 +197,10 @@ def _is_range(value: Any) -> bool:
 
 
 _FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "uniform": ("[a, b] with a <= b", lambda value: _is_pair(value) and 0 <= value[1] - value[0] < math.inf),
+    "uniform": (
+        "[a, b] with a <= b and b - a finite",
+        lambda value: _is_pair(value) and 0 <= value[1] - value[0] < math.inf,
+    ),
     "normal": ("[mean, sigma] with sigma >= 0", lambda value: _is_pair(value) and value[1] >= 0),
     "integers": ("[a, b] with whole a < b, b excluded", _is_range),
     "choice": ("[..] with at least one alternative", lambda value: isinstance(value, list) and len(value) > 0),
