@@ -22,10 +22,10 @@ README = (ROOT / "README.md").read_text()
 
 # What makes a recipe small enough for a test; each must stand in the README.
 SMALLER = {
-    "train/narrow train/wide train/network train/tight train/gallery train/low --seeds 100:110": (
+    "train/narrow train/wide train/network train/tight train/gallery train/low train/mine --seeds 100:110": (
         "smoke/one_box --seeds 3:4 --draws 2"
     ),
-    "narrow wide network tight train/gallery train/low --seeds 10000:10004": (
+    "narrow wide network tight train/gallery train/low train/mine --seeds 10000:10004": (
         "smoke/one_box --seeds 10003:10004 --draws 2"
     ),
     "tunnelcd train data --out trained": "tunnelcd train data --out trained --steps 3 --threads 1",

@@ -148,7 +148,10 @@ class SphereTask:
             )
 
     def losses(self, step: int) -> dict[str, Tensor]:
-        """Return the classification loss of the sectors and that of the keyframes."""
+        """Return the classification loss of the sectors and that of the keyframes.
+
+        A keyframe of which some sectors are ignored and no sector is changed is ignored, too: it is not unchanged.
+        """
         before, after, targets = self.batch(step)
         logits = compute(self.network, before, after)
         is_known = targets >= 0
@@ -156,8 +159,11 @@ class SphereTask:
         each = functional.binary_cross_entropy_with_logits(
             logits, targets.clamp(min=0), reduction="none", pos_weight=weight
         )
-        has_changed = (targets == 1).any(dim=1).float()
-        of_place = functional.binary_cross_entropy_with_logits(logits.logsumexp(dim=1), has_changed)
+        has_changed = (targets == 1).any(dim=1)
+        is_told = has_changed | is_known.all(dim=1)
+        of_place = functional.binary_cross_entropy_with_logits(
+            logits.logsumexp(dim=1)[is_told], has_changed[is_told].float()
+        )
         return {"sector": (each * is_known).sum() / is_known.sum(), "keyframe": _PLACE_WEIGHT * of_place}
 
     def batch(self, step: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -117,6 +117,20 @@ def test_training_tells_where_the_blocks_stand() -> None:
     assert task.scores()["auroc"] == 1.0
 
 
+def test_a_keyframe_with_ignored_sectors_alone_is_not_called_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = _walls(12, {0: (6, 2), 1: (7, 9), 2: (5, 14)})
+    task = SphereTask(make_untrained_sphere_network(), data, data, seed=3)
+    before, after, targets = task.batch(0)
+    told = task.losses(0)["keyframe"]
+    unsure = targets.clone()
+    unsure[-1] = torch.where(torch.arange(SECTORS) == 4, -1.0, 0.0)  # something hardly stands out there
+    monkeypatch.setattr(task, "batch", lambda _: (before, after, unsure))
+    without = task.losses(0)["keyframe"]
+    monkeypatch.setattr(task, "batch", lambda _: (before[:-1], after[:-1], targets[:-1]))
+    torch.testing.assert_close(without, task.losses(0)["keyframe"])
+    assert without != told
+
+
 def test_scores_are_agreed_on_by_neighbours_and_reach_the_radius() -> None:
     data = _walls(6, {2: (6, 3)})
     near = replace(data, positions=data.positions / 5.0)  # 2 m apart
