@@ -80,6 +80,19 @@ def clean_family(name: str) -> str | None:
     return base if base in family_files() else None
 
 
+@cache
+def tunnel_family(name: str) -> str:
+    """Return the family whose tunnels a family has, seed by seed: that which it extends without a tunnel of its own.
+
+    `odometry/legged` and `null/narrow` have the tunnels of `narrow`, `surface/heave` those of `surface/convergence`.
+    """
+    if name not in family_files():
+        return name
+    document = read_yaml(family_files()[name]).value
+    base = clean_family(name) or (document.get("extends") if "tunnel" not in document else None)
+    return tunnel_family(base) if base in family_files() else name
+
+
 def prop_files() -> dict[str, Path]:
     """Return the file of every kind of prop on the search path by its name.
 

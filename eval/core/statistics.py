@@ -57,7 +57,7 @@ def summarise(
             rows.append({**names, "metric": metric, **_summary(metric, values, is_ok, seed), **counts})
         if keyframes is not None:
             of_group = of_groups.get((group, variant), keyframes[:0])
-            rows += [{**names, **pooled, **counts} for pooled in _pooled(of_group)]
+            rows += [{**names, **pooled, **counts} for pooled in _pooled(of_group, cases[is_ok])]
     columns = [by, "variant", "metric", "statistic", "value", "low", "high", "value_ok"]
     return pd.DataFrame(rows, columns=[*columns, "n", "n_failed", "n_used", "n_used_ok"])
 
@@ -236,17 +236,18 @@ def _summary(
     }
 
 
-def _pooled(keyframes: pd.DataFrame) -> list[dict[str, Any]]:
+def _pooled(keyframes: pd.DataFrame, ok_cases: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows of AUROC and AP over all keyframes, and over those of the cases that are ok."""
+    pair = ["scenario", "seed"]
     used = keyframes[keyframes["label"] >= 0]
-    scores = used["score"].to_numpy(dtype=np.float64)
-    is_positive = used["label"].to_numpy() == 1
-    n_pairs = int(used.groupby(["scenario", "seed"]).ngroups)
-    counts = {"n_used": n_pairs, "n_used_ok": n_pairs}
+    used_ok = used[pd.MultiIndex.from_frame(used[pair]).isin(pd.MultiIndex.from_frame(ok_cases[pair]))]
+    counts = {"n_used": int(used.groupby(pair).ngroups), "n_used_ok": int(used_ok.groupby(pair).ngroups)}
     unknown = dict.fromkeys(("low", "high"), float("nan"))
-    return [
-        {"metric": f"{name}_pooled", "statistic": "pooled", "value": value, "value_ok": value, **unknown, **counts}
-        for name, value in (
-            ("region_auroc", auroc(scores, is_positive)),
-            ("region_ap", average_precision(scores, is_positive)),
+    rows = []
+    for name, measure in (("region_auroc", auroc), ("region_ap", average_precision)):
+        value, value_ok = (
+            measure(part["score"].to_numpy(dtype=np.float64), part["label"].to_numpy() == 1) for part in (used, used_ok)
         )
-    ]
+        told = {"metric": f"{name}_pooled", "statistic": "pooled", "value": value, "value_ok": value_ok}
+        rows.append({**told, **unknown, **counts})
+    return rows

@@ -205,6 +205,6 @@ def _caption(own: pd.DataFrame) -> str:
     ]
     return (
         "Higher is better, farther left is cheaper. The line joins the methods that no other method beats in both. "
-        "Bars: 95 % interval of the quality over session pairs. Hollow: the method is given the truth, or ran fewer "
+        "Bars: 95 % interval of the quality, tunnels drawn. Hollow: the method is given the truth, or ran fewer "
         f"pairs, and does not compete. On the front: {'; '.join(told)}."
     )

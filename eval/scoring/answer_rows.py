@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -47,19 +49,10 @@ def find_rows_near_points(
         return [np.zeros(0, dtype=np.int64) for _ in objects_odom]
     tree = cKDTree(np.concatenate(objects_odom))
     owners = np.repeat(np.arange(len(objects_odom)), [len(points) for points in objects_odom])
-    rows = []
-    for index, points in enumerate(objects_odom):
-        if len(points) == 0:
-            rows.append(np.zeros(0, dtype=np.int64))
-            continue
-        low, high = points.min(axis=0) - radius_m, points.max(axis=0) + radius_m
-        inside = np.ones(len(scoring_points), dtype=np.bool_)
-        for axis in range(3):
-            values = scoring_points.points_odom[:, axis]
-            inside &= (values >= low[axis]) & (values <= high[axis])
-        candidates = np.flatnonzero(inside)
-        points_odom = scoring_points.points_odom[candidates].astype(np.float64)
-        # the bound is exclusive; without a neighbour the index is the number of points
-        _, nearest = tree.query(points_odom, distance_upper_bound=np.nextafter(radius_m, np.inf))
-        rows.append(candidates[np.append(owners, -1)[nearest] == index])
-    return rows
+    points_odom = scoring_points.points_odom.astype(np.float64)
+    # the bound is exclusive; without a neighbour the index is the number of points
+    _, nearest = tree.query(points_odom, distance_upper_bound=np.nextafter(radius_m, np.inf))
+    owner = np.append(owners, -1)[nearest]
+    order = np.argsort(owner, kind="stable")
+    starts = np.searchsorted(owner[order], np.arange(len(objects_odom) + 1))
+    return [order[start:end] for start, end in itertools.pairwise(starts)]

@@ -17,6 +17,8 @@ from eval.truth.ground_truth import GroundTruth
 from sim.session.truth import Change
 
 PILE_KIND = "muck_pile"
+# Within this angle an object of unknown height counts as upright alike: half a metre of it moves its middle by 2 cm.
+_SAME_UP_DEG = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +60,8 @@ def find_true_displacements_map(truth: GroundTruth, labels: Sequence[Label] | No
 
     A displacement joins the centres of the object's bounding box before and after the move. Each centre is transformed
     into the map frame by the true pose of the judged before scan nearest to it in the world. The drift of the before
-    odometry between both places belongs to the map frame and is no error of the answer.
+    odometry between both places belongs to the map frame and is no error of the answer. The truth knows no height of a
+    prop from a mesh, so one that fell over or got up has none.
 
     Args:
         truth: The pair's truth, C changes.
@@ -73,7 +76,8 @@ def find_true_displacements_map(truth: GroundTruth, labels: Sequence[Label] | No
     places = transform_to_map(middles_world, truth.before)
     moves = np.full((len(changes), 3), np.nan)
     for index, (change, label) in enumerate(zip(changes, labels or list_drawn_labels(truth), strict=True)):
-        if label.other >= 0:
+        other = changes[label.other]
+        if label.other >= 0 and (change.name in heights_m or _are_upright_alike(change, other)):
             ends = (label.other, index) if change.session == "after" else (index, label.other)
             moves[index] = places[ends[1]] - places[ends[0]]
     return moves
@@ -96,6 +100,12 @@ def summarise_size_errors(errors: SizeErrors, truth: GroundTruth) -> dict[str, f
         "displacement_error_m": median(errors.displacement_m),
         "pile_volume_error": median(np.abs(errors.volume_share[is_pile])),
     }
+
+
+def _are_upright_alike(a: Change, b: Change) -> bool:
+    """Tell whether two objects have the same direction upwards."""
+    up_a, up_b = (np.asarray(each.world_T_object)[:3, 2] for each in (a, b))
+    return bool(up_a @ up_b >= np.cos(np.deg2rad(_SAME_UP_DEG)))
 
 
 def _find_middle_world(change: Change, height_m: float) -> Float64Array:

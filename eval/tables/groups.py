@@ -89,7 +89,8 @@ def recall_by_size(ranked: RankedPairs, changes: pd.DataFrame) -> list[dict[str,
     """
     own = changes.iloc[ranked.change_rows]
     found = {
-        "recall_at_k": ranked.change_rank < ranked.n_observable[ranked.change_pair],
+        "recall_at_k": np.isfinite(ranked.change_score)
+        & (ranked.change_rank < ranked.n_observable[ranked.change_pair]),
         "recall_reported": own["is_found"].astype(bool).to_numpy(),
         "recall_at_rate": found_at(ranked, RATE_PER_100M),
     }

@@ -13,10 +13,9 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.geometry import BoolArray
-from eval.core.statistics import wilson_interval
 from eval.plans.targets import Targets, is_oracle
 from eval.tables.conditions import ANY, odometry_of, told_apart
-from eval.tables.rows import numbers, texts
+from eval.tables.rows import numbers, texts, wilson_over_tunnels, with_pair
 
 RIGHT_M, RIGHT_DEG = 0.5, 2.0
 EXACT_M, EXACT_DEG = 0.05, 0.3
@@ -92,12 +91,14 @@ def merge_table(results: pd.DataFrame, targets: Targets) -> pd.DataFrame:
     Returns:
         `pair_kind`; `odometry` of both sessions; `family`, "all" in the rows over all; `variant`; the counts `n_pairs`,
         `n_accepted`, `n_refused`, `n_failed`, `n_within_target`; `share_within_target` of all pairs with its 95 %
-        Wilson interval `low` to `high`; `target_share`; `n_wrong_accepted`; `n_p95_over_half_m`, accepted pairs whose
-        95th percentile along the path is over 0.5 m; `is_met`: the share reaches the target's and none is wrong and
-        accepted (neither target nor verdict for a merge by the truth); `n_named_degeneracy` of the refusals; `median_`
-        and `p95_` over the accepted pairs of each error, `n_` of them defined, and the median, 95th percentile and
-        number of each time. Rows without a kind are left out.
+        Wilson interval `low` to `high`, as of so many pairs as there are tunnels; `target_share`; `n_wrong_accepted`;
+        `n_p95_over_half_m`, accepted pairs whose 95th percentile along the path is over 0.5 m; `is_met`: the share
+        reaches the target's and none is wrong and accepted (neither target nor verdict for a merge by the truth);
+        `n_named_degeneracy` of the refusals; `median_` and `p95_` over the accepted pairs of each error, `n_` of them
+        defined, and the median, 95th percentile and number of each time. Rows without a kind, and of worlds that were
+        not made, are left out.
     """
+    results = with_pair(results)
     kind = kinds(results)
     family = results["family" if "family" in results else "scenario"]
     odometry = odometry_of(results)
@@ -143,7 +144,7 @@ def _counts(group: pd.DataFrame, targets: Targets) -> dict[str, Any]:
     kind, nan = str(group["pair_kind"].iloc[0]), float("nan")
     has_rule = kind in RULES
     share = n_within / len(group) if has_rule else nan
-    low, high = wilson_interval(n_within, len(group)) if has_rule else (nan, nan)
+    low, high = wilson_over_tunnels(is_within_target(group), group) if has_rule else (nan, nan)
     asked = None if is_oracle(str(group["variant"].iloc[0])) else targets.share(kind)
     n_refused = int((status == "merge_refused").sum())
     return {

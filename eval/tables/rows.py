@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -11,8 +10,8 @@ import pandas as pd
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from eval.core.domains import domain_of
-from eval.core.statistics import interval_over_tunnels, mean
-from scenarios.catalogue import clean_family
+from eval.core.statistics import interval_over_tunnels, mean, wilson_interval
+from scenarios.catalogue import tunnel_family
 
 PAIR = ["scenario", "seed"]
 ALL_DOMAINS = "all"
@@ -41,20 +40,12 @@ def numbers(table: pd.DataFrame, column: str) -> Float64Array:
 def tunnel_numbers(worlds: Iterable[str], seeds: Iterable[int]) -> Int64Array:
     """Return (N,) a number for the tunnel of each pair, in the order of their first pairs.
 
-    Pairs of one seed share tunnel and drives where their worlds differ by settings, or by one effect of a mine
-    (`scenarios.catalogue.clean_family`). They are no independent samples: intervals draw them together.
+    Pairs of one seed share it where their worlds differ by settings, or their families by anything but the tunnel
+    (`scenarios.catalogue.tunnel_family`). They are no independent samples: intervals draw them together.
     """
-    keys = [(_tunnel_of(str(world)), int(seed)) for world, seed in zip(worlds, seeds, strict=True)]
+    keys = [(tunnel_family(str(world).partition("[")[0]), int(seed)) for world, seed in zip(worlds, seeds, strict=True)]
     place: dict[tuple[str, int], int] = {}
     return np.array([place.setdefault(key, len(place)) for key in keys], dtype=np.int64)
-
-
-@lru_cache(maxsize=1024)
-def _tunnel_of(world: str) -> str:
-    family = world.partition("[")[0]
-    while (base := clean_family(family)) is not None:
-        family = base
-    return family
 
 
 def tunnels_of(table: pd.DataFrame) -> Int64Array:
@@ -94,10 +85,22 @@ def is_answered(cases: pd.DataFrame) -> BoolArray:
     return told.to_numpy(dtype=np.bool_)
 
 
+def with_pair(results: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of results.csv that have a pair: a world that was not made asks nothing."""
+    if "n_observable" not in results:
+        return results
+    return results[results["n_observable"].notna() | (results["status"] == "ok")]
+
+
+def wilson_over_tunnels(is_hit: BoolArray, results: pd.DataFrame) -> tuple[float, float]:
+    """Return the 95 % Wilson interval of the share of (N,) pairs that are hits, as of so many as there are tunnels."""
+    share = len(np.unique(tunnels_of(results))) / max(len(results), 1)
+    return wilson_interval(int(np.count_nonzero(is_hit)) * share, len(results) * share)
+
+
 def count_failed(results: pd.DataFrame) -> int:
-    """Return how many rows of results.csv have a pair, but no answer: a world that was not made asks nothing."""
-    is_judged = results["n_observable"].notna() if "n_observable" in results else True
-    return int(((results["status"] != "ok") & is_judged).sum())
+    """Return how many rows of results.csv have a pair, but no answer."""
+    return int((with_pair(results)["status"] != "ok").sum())
 
 
 def stated(cases: pd.DataFrame, column: str) -> Float64Array:

@@ -107,7 +107,7 @@ def _limits_chart(limits: pd.DataFrame, domain: str) -> Chart:
     n_windows = int(limits.groupby("variant")["n_windows"].sum().max())
     caption = (
         "Share of the windows that are found, over the size of their mean displacement. The threshold of each method "
-        "and area lets 5 % of its null windows pass. Bars: 95 % interval, session pairs drawn. "
+        "and area lets 5 % of its null windows pass. Bars: 95 % interval, tunnels drawn. "
         f"{domain_name(domain).capitalize()}, {n_windows} windows; detection_limits.csv has every point, and those of "
         "methods that were told the merge."
     )

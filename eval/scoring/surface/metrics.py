@@ -97,7 +97,7 @@ def score_surface(answer: Answer, truth: GroundTruth, after_path_m: float) -> Su
             np.array([min(row["volume_error_share"], 1.0) for row in asked if row["kind"] in VOLUME_KINDS])
         ),
         "n_surface_places": int(np.count_nonzero(places.is_judged)),
-        "n_surface_changes": len(asked),
+        "n_surface_changes": len(asked) if is_surface_pair(truth) else _NAN,
         "n_surface_regions": len(is_true),
         "t_surface_s": float(answer.seconds.get("t_surface_s", _NAN)),
     }
@@ -171,7 +171,10 @@ def _score_change(
 def _answered_volume(
     surface: SurfaceField, said: SurfaceAnswer, places: SurfacePlaces, change: int, sign: float
 ) -> float:
-    """Return the summed volume of the regions of one sign that hold more places of this change than of any other."""
+    """Return the summed volume of the regions of one sign that hold more places of this change than of any other.
+
+    Of changes of that sign with equally many the first has the region.
+    """
     total_m3 = 0.0
     is_held = places.is_judged & places.is_changed & (said.region >= 0)
     for region in np.unique(said.region[is_held & (places.change == change)]):
@@ -179,6 +182,8 @@ def _answered_volume(
         # changed places of no change belong to nobody
         n_of_change[0] = 0
         volume_m3 = surface.regions[region].volume_m3
-        if n_of_change[change] == n_of_change.max() and np.sign(volume_m3) == sign:
+        equals = np.flatnonzero(n_of_change == n_of_change.max())
+        suits = [each for each in equals if np.sign(places.true_m[is_held & (places.change == each)].sum()) == sign]
+        if change in suits[:1] and np.sign(volume_m3) == sign:
             total_m3 += volume_m3
     return total_m3

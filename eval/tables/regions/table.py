@@ -16,7 +16,7 @@ import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
 from cdpipe.core.ranking import auroc
-from eval.core.statistics import interval_of, mean, median, wilson_interval
+from eval.core.statistics import interval_of, mean, median
 from eval.plans.targets import Targets
 from eval.tables.conditions import by_condition, told_apart
 from eval.tables.groups import recall_by_size
@@ -37,7 +37,7 @@ from eval.tables.rows import (
     means_with_intervals,
     numbers,
     of_cases,
-    tunnels_of,
+    wilson_over_tunnels,
     with_domain,
 )
 from eval.tables.targets import is_unchanged_pair, judged_targets
@@ -163,7 +163,7 @@ def _counts(own: pd.DataFrame) -> dict[str, Any]:
         "n_unchanged": n_unchanged,
         "n_silent": n_silent,
         "silent_share": n_silent / n_unchanged if n_unchanged else math.nan,
-        **dict(zip(("silent_low", "silent_high"), _interval_of_silence(alarms, unchanged), strict=True)),
+        **dict(zip(("silent_low", "silent_high"), wilson_over_tunnels(alarms == 0, unchanged), strict=True)),
         "km_unchanged": unchanged_m / 1000.0,
         "false_regions_per_100m_unchanged": 100.0 * n_false_unchanged / unchanged_m if unchanged_m > 0 else math.nan,
         "bytes_map_before": _mean_of_all(map_bytes),
@@ -171,12 +171,6 @@ def _counts(own: pd.DataFrame) -> dict[str, Any]:
         "bytes_ratio": _mean_of_all(map_bytes / np.where(kept_bytes >= 1, kept_bytes, math.nan)),
         **{name: median(numbers(answered, name)) for name in _MEDIANS},
     }
-
-
-def _interval_of_silence(alarms: Float64Array, unchanged: pd.DataFrame) -> tuple[float, float]:
-    """Return the Wilson interval of the share of silent pairs, as of so many as there are tunnels."""
-    share = len(np.unique(tunnels_of(unchanged))) / max(len(unchanged), 1)
-    return wilson_interval(int((alarms == 0).sum()) * share, len(unchanged) * share)
 
 
 def _mean_of_all(values: Float64Array) -> float:

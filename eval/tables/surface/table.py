@@ -83,7 +83,7 @@ def _mark_asked(results: pd.DataFrame) -> BoolArray:
     """Mark the rows with scores of a field on pairs that ask for one; where no pair asks, all rows with such scores."""
     is_scored = ~np.isnan(numbers(results, "surface_cover"))
     is_surface = np.array([name.partition("/")[0] == SURFACE_GROUP for name in texts(results, "family")], np.bool_)
-    is_asked = is_scored & (is_surface | (numbers(results, "n_surface_changes") > 0))
+    is_asked = is_scored & (is_surface | ~np.isnan(numbers(results, "n_surface_changes")))
     return is_asked if is_asked.any() else is_scored
 
 

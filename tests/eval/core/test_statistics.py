@@ -107,6 +107,18 @@ def test_pooled_ranking_is_that_of_all_keyframes_together() -> None:
     assert (pooled["statistic"], pooled["n_used"]) == ("pooled", 3)
 
 
+def test_pooled_ranking_of_the_cases_that_are_ok_is_of_their_keyframes_alone() -> None:
+    one = {"scenario": "a", "variant": "paper"}
+    keyframes = pd.DataFrame(
+        [one | {"seed": 0, "score": float(n), "label": n} for n in (0, 1)]
+        + [one | {"seed": 1, "score": 0.0, "label": n} for n in (0, 1)]
+    )
+    cases = pd.DataFrame([one | {"seed": 0, "status": "ok"}, one | {"seed": 1, "status": "merge_refused"}])
+    pooled = line(summarise(cases, keyframes=keyframes), "a", "paper", "region_auroc_pooled")
+    assert (pooled["value"], pooled["value_ok"]) == (0.75, 1.0)
+    assert (pooled["n_used"], pooled["n_used_ok"]) == (2, 1)
+
+
 def test_the_interval_of_many_pairs_is_that_of_gathered_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     values = np.random.default_rng(1).normal(size=300)
     for has_nan in (False, True):

@@ -96,14 +96,21 @@ def test_what_is_not_matched_or_never_moved_has_no_displacement() -> None:
     assert find_true_displacements_map(truth_of([])).shape == (0, 3)
 
 
-@pytest.mark.parametrize("height_m", [0.0, 1.0])
-def test_it_is_the_middle_that_moves_when_a_thing_falls_over(height_m: float) -> None:
+def test_it_is_the_middle_that_moves_when_a_thing_falls_over() -> None:
     # lying, its own x axis points down: its middle, half its height along its own z, points to world x
     lying = make_pose(np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]), (4.0, 0.0, 0.0))
-    props = {"props": [{"name": "thing", "size_m": [0.5, 0.5, height_m]}, {"name": "mesh", "size_m": None}]}
-    truth = truth_of(moved(make_pose(translation=(2.0, 0.0, 0.0)), lying), **(props if height_m else {}))
-    expected = (2.0 + height_m / 2, 0.0, -height_m / 2)
+    props = [{"name": "thing", "size_m": [0.5, 0.5, 1.0]}, {"name": "mesh", "size_m": None}]
+    truth = truth_of(moved(make_pose(translation=(2.0, 0.0, 0.0)), lying), props=props)
+    expected = (2.5, 0.0, -0.5)
     np.testing.assert_allclose(find_true_displacements_map(truth), [expected, expected], atol=1e-12)
+
+
+def test_of_a_prop_from_a_mesh_that_fell_over_nobody_knows_the_middle() -> None:
+    lying = make_pose(np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]), (4.0, 0.0, 0.0))
+    props = [{"name": "thing", "size_m": None}]
+    assert np.isnan(find_true_displacements_map(truth_of(moved(np.eye(4), lying), props=props))).all()
+    turned = truth_of(moved(np.eye(4), yaw_pose(1.0, (4.0, 0.0, 0.0))), props=props)
+    np.testing.assert_allclose(find_true_displacements_map(turned)[0], [4.0, 0.0, 0.0], atol=1e-12)
 
 
 def test_both_halves_say_the_same_and_a_turned_map_turns_it() -> None:

@@ -1,5 +1,7 @@
 """What a run says about its merges, worked out by hand."""
 
+import itertools
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,6 +11,7 @@ from eval.plans.targets import Targets
 from eval.tables.merge_table import ALL_FAMILIES, is_within_target, is_wrong, merge_overview, merge_table
 
 NAN = float("nan")
+SEEDS = itertools.count(1)
 TARGETS = Targets(merge={"clean": 0.99, "drift": 0.95, "smooth": 1.0, "disjoint": 1.0})
 SLIDES = "the sessions cannot be merged: it can slide; merge.min_hessian_ratio asks for 0.01"
 UNLIKE = "the sessions cannot be merged: it does not fit; merge.min_agreement asks for 80%"
@@ -21,7 +24,7 @@ def case(
     return {
         "scenario": f"merge/{columns.get('family', 'narrow')}",
         "family": "narrow",
-        "seed": 1,
+        "seed": next(SEEDS),
         "variant": "ours",
         "status": status,
         "error": "",
@@ -193,3 +196,16 @@ def test_wilson_by_hand_and_of_nothing() -> None:
     # 20 of 20: 1 / (1 + 1.96^2 / 20)
     assert wilson_interval(20, 20) == pytest.approx((0.83887, 1.0), abs=1e-5)
     assert all(np.isnan(wilson_interval(0, 0)))
+
+
+def test_a_world_that_was_not_made_asks_nothing_of_a_merge() -> None:
+    rows = [case("clean", metres=0.01, n_observable=2) for _ in range(60)]
+    row = the_row([*rows, case("clean", "failed", error="no place for a prop", n_observable=NAN)], "clean")
+    assert (row["n_pairs"], row["n_failed"], row["share_within_target"], row["is_met"]) == (60, 0, 1.0, True)
+
+
+def test_pairs_of_one_tunnel_make_no_narrower_interval() -> None:
+    rows = [case("clean", metres=0.01, seed=seed) for seed in (1, 2, 3)]
+    twins = [{**row, "scenario": f"merge/narrow[sensor.sub_rays={n}]"} for row in rows for n in (1, 7)]
+    row = the_row(twins, "clean")
+    assert (row["n_pairs"], row["low"], row["high"]) == (6, *wilson_interval(3, 3))

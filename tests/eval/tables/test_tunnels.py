@@ -20,6 +20,12 @@ def test_worlds_that_differ_by_one_effect_or_by_settings_share_a_tunnel() -> Non
     assert tunnel_numbers(worlds, [5] * 6 + [6, 5]).tolist() == [0, 0, 0, 0, 1, 1, 2, 3]
 
 
+def test_families_without_a_tunnel_of_their_own_have_that_of_the_extended_one() -> None:
+    narrow = ["narrow", "odometry/legged", "null/narrow", "glare/null", "drift/narrow", "train/mine", "water/null"]
+    others = ["surface/heave", "surface/null", "surface/wide", "disjoint/narrow", "tight", "train/gallery"]
+    assert tunnel_numbers([*narrow, *others], [5] * 13).tolist() == [0] * 7 + [1, 1, 2, 3, 4, 5]
+
+
 def test_twins_do_not_narrow_an_interval() -> None:
     values = {3: 0.2, 4: 0.5, 7: 0.9}
     rows = [{"scenario": world, "seed": seed, "x": value} for world in TWINS for seed, value in values.items()]

@@ -189,6 +189,13 @@ def test_the_volume_of_a_region_counts_where_single_places_in_it_have_the_wrong_
         assert volumes == pytest.approx(wanted)
 
 
+def test_the_volume_of_a_region_that_holds_as_much_of_two_changes_counts_once() -> None:
+    truth = wall_truth({1: (5, 1, 1, 1, -0.2), 2: (9, 1, 1, 1, -0.2)}, kinds={1: "scar", 2: "scar"})
+    field = true_field(truth)
+    answer = replace(field, region=np.where(field.region == 1, 0, field.region).astype(np.int32))
+    assert [row["answered_volume_m3"] for row in score_field(truth, answer).surface_changes] == [-0.2, 0.0]
+
+
 def test_columns_are_those_that_are_listed() -> None:
     truth = wall_truth({1: (5, 1, 2, 2, -0.1)})
     assert set(surface_columns(score_field(truth, true_field(truth)))) == {*COLUMNS}

@@ -300,3 +300,9 @@ def test_the_run_prints_and_writes_the_tables_only_where_the_plan_asks(
     assert not any((out / f"{name}.csv").exists() for name in FILES)
     command("report", out)
     assert 'id="regions"' not in (out / "index.html").read_text()
+
+
+def test_who_proposes_nothing_has_no_recall_at_k() -> None:
+    rows = [changed("regions/narrow", seed, "c2c") for seed in (1, 2)]
+    by_size = tables(rows)["regions_by_size"]
+    assert len(by_size) and (by_size["recall_at_k"] == 0).all()

@@ -111,6 +111,13 @@ def case(seed: int, **columns: object) -> dict:
     }  # fmt: skip
 
 
+def test_a_pair_counts_though_its_rock_moved_too_little_to_be_observed() -> None:
+    graft = {"scenario": "graft/mine", "family": "graft/mine"}
+    results = pd.DataFrame([case(1, **graft), case(2, **graft, surface_cover=0.0, n_surface_changes=0)])
+    (row,) = surface_tables(results, pd.DataFrame(null_windows()), Targets())["surface_table"].to_dict("records")
+    assert (row["n_pairs"], row["surface_cover"]) == (2, 0.5)
+
+
 def test_a_pair_without_an_answer_counts_and_a_pair_that_asks_nothing_does_not() -> None:
     results = pd.DataFrame(
         [
