@@ -13,10 +13,11 @@ from cdpipe.extract.surface_rule import BEYOND_M
 from cdpipe.model.report import ChangeRegions
 
 _BALL_STEPS = 200
+_ROUNDING_M = 1e-6
 
 
 def centre_regions(
-    regions: ChangeRegions, groups: Sequence[PointGroup], *, withdraw: bool = True
+    regions: ChangeRegions, groups: Sequence[PointGroup], *, withdraw: bool = True, most: int | None = None
 ) -> tuple[ChangeRegions, list[PointGroup]]:
     """Centre every reported region on the objects in its sphere; withdraw it if better regions contain all of them.
 
@@ -36,24 +37,25 @@ def centre_regions(
     Args:
         regions: Candidates; the reported ones are centred.
         groups: All objects, at least one.
-        withdraw: Withdraw the regions whose objects are all in better ones; otherwise they stay where they are.
+        withdraw: Withdraw the regions with objects that are all in better ones; otherwise they stay where they are.
+        most: Largest number of regions to report; None for any.
 
     Returns:
         The regions, with the centres at which they were proposed; and the groups, each with the nearest
         reported region that reaches it.
     """
-    centres, is_reported = regions.centres_map.copy(), regions.is_reported.copy()
+    centres, is_reported, objects = regions.centres_map.copy(), regions.is_reported.copy(), _Objects(groups)
     centred: list[int] = []
     for region, radius_m in enumerate(regions.radii_m.tolist()):
         if not regions.is_reported[region]:
             continue
         taken = centres[centred], regions.radii_m[centred]
-        parts = _parts_within(groups, regions.centres_map[region], radius_m)
+        parts = objects.parts_within(regions.centres_map[region], radius_m)
         own = [index for index, part in parts.items() if not _is_within(part.mean(axis=0), *taken)]
         if own:
             places = [parts[index].mean(axis=0) for index in own]
             centre = _enclosing_centre(np.array(places), radius_m)
-            reached = _parts_within(groups, centre, radius_m)
+            reached = objects.parts_within(centre, radius_m)
             more = [part.mean(axis=0) for index, part in reached.items() if index not in own]
             here = centre[None], np.array([radius_m])
             places += [place for place in more if _is_within(place, *here) and not _is_within(place, *taken)]
@@ -61,9 +63,9 @@ def centre_regions(
             centred.append(region)
         elif parts and withdraw:
             is_reported[region] = False
-    for group in groups:
-        place = group.points_map.mean(axis=0)
-        if _is_within(place, centres[is_reported], regions.radii_m[is_reported]):
+    for place in objects.middles:
+        is_full = most is not None and np.count_nonzero(is_reported) >= most
+        if is_full or _is_within(place, centres[is_reported], regions.radii_m[is_reported]):
             continue
         holding = np.linalg.norm(regions.centres_map - place, axis=1) <= regions.radii_m
         if len(found := np.flatnonzero(holding & ~is_reported)):
@@ -86,17 +88,28 @@ def _with_nearest_region(group: PointGroup, regions: ChangeRegions) -> PointGrou
     return replace(group, region=region) if np.isfinite(away_m[region]) else group
 
 
-def _parts_within(groups: Sequence[PointGroup], centre: Float64Array, radius_m: float) -> dict[int, Float64Array]:
-    """Return the points (P, 3) within `BEYOND_M` of a sphere of each object, by index, that has a point in the sphere.
+class _Objects:
+    """Objects, each in a ball around its centroid: only those of which the ball reaches a sphere are measured."""
 
-    The objects with the most points come first.
-    """
-    parts = {}
-    for index, group in enumerate(groups):
-        away_m = np.linalg.norm(group.points_map - centre, axis=1)
-        if away_m.min() <= radius_m:
-            parts[index] = group.points_map[away_m <= radius_m + BEYOND_M]
-    return dict(sorted(parts.items(), key=lambda item: -len(item[1])))
+    def __init__(self, groups: Sequence[PointGroup]) -> None:
+        self._points = [group.points_map for group in groups]
+        self.middles = np.array([points.mean(axis=0) for points in self._points])
+        self._reach_m = np.array(
+            [np.linalg.norm(p - middle, axis=1).max() for p, middle in zip(self._points, self.middles, strict=True)]
+        )
+
+    def parts_within(self, centre: Float64Array, radius_m: float) -> dict[int, Float64Array]:
+        """Return the points (P, 3) within `BEYOND_M` of a sphere of each object, by index, that has a point in it.
+
+        The objects with the most points come first.
+        """
+        parts = {}
+        is_near = np.linalg.norm(self.middles - centre, axis=1) <= radius_m + self._reach_m + _ROUNDING_M
+        for index in np.flatnonzero(is_near).tolist():
+            away_m = np.linalg.norm(self._points[index] - centre, axis=1)
+            if away_m.min() <= radius_m:
+                parts[index] = self._points[index][away_m <= radius_m + BEYOND_M]
+        return dict(sorted(parts.items(), key=lambda item: -len(item[1])))
 
 
 def _is_within(place: Float64Array, centres: Float64Array, radii_m: Float64Array) -> bool:

@@ -136,7 +136,7 @@ def extract_changes(
     groups = cut_objects(merged, regions, config)
     regions = withdraw_empty_regions(regions, groups, config)
     if groups and config.extract.method == "surface" and config.extract.recentre:
-        regions, groups = centre_regions(regions, groups, withdraw=config.extract.withdraw)
+        regions, groups = centre_regions(regions, groups, withdraw=config.extract.withdraw, most=config.query.n_regions)
     grouped = perf_counter()
     objects = assemble_objects(merged, groups)
     end = perf_counter()

@@ -7,7 +7,8 @@ surfaces that then coincides decides whether they are one object; the registrati
 
 If an object moved by less than its own length, only two strips of it were extracted, and these need not be similar. The
 overlap of both poses appears unchanged and is part of the surroundings. Neighbouring objects are therefore registered
-together with the surroundings of the other session.
+together with the surroundings of the other session. Neighbours that are unlike and would have moved farther are judged
+as objects elsewhere.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ _PART_FACTOR, _PART_SHARE, _PART_LIKENESS = 2.0, 0.65, 0.77
 _BESIDE_M = 1.5
 _BESIDE_SHARE, _EITHER_SHARE = 0.4, 0.2
 _LIKENESS = 0.62
+# Share of its length from which an object has moved by all of it: then both sessions saw it whole, and not strips.
+_WHOLE_LENGTH = 0.9
 # Tipped objects, which may turn in any way: least mean share and least likeness.
 _TIPPED_SHARE, _TIPPED_LIKENESS = 0.65, 0.72
 _MIN_POINTS = 4
@@ -99,7 +102,9 @@ def find_moves(
     found: dict[tuple[int, int], _Match | None] = {}
     for (r, a), (before, after) in zip(beside, around(beside), strict=True):
         ends = gone[r].with_rest(before), come[a].with_rest(after)
-        found[r, a] = _match_pair(*ends, align, _BESIDE_SHARE, _LIKENESS)
+        match = _match_pair(*ends, align, _BESIDE_SHARE, _LIKENESS)
+        if match is None or match.are_strips or _misfits(gone[r], extents[a]) <= np.log(_FAR_FACTOR):
+            found[r, a] = match
     for r, start in enumerate(gone):
         for a in _partners_elsewhere(start, come, extents, nearest_twins):
             if (r, a) not in found:
@@ -113,7 +118,7 @@ def find_moves(
     tie_per_m = _TWIN_TIE_PER_M if nearest_twins else _TIE_PER_M
     gain = np.zeros((len(gone), len(come)))
     for pair, match in matches.items():
-        gain[pair] = match.points / (1.0 + tie_per_m * float(np.linalg.norm(match.shift_map[:2])))
+        gain[pair] = match.points / (1.0 + tie_per_m * float(np.linalg.norm(match.shift_map)))
     pairs = zip(*(each.tolist() for each in linear_sum_assignment(gain, maximize=True)), strict=True)
     return [Move(r, a, matches[r, a].shift_map) for r, a in pairs if (r, a) in matches]
 
@@ -128,12 +133,14 @@ class _Match:
         share: The larger share of a surface on the other. If an object was seen sparsely in one session, its points
             still lie on the surface of the other.
         shift_map: (3,) displacement, metres.
+        are_strips: Whether it moved by less than its length, so that either object may be a strip of it.
     """
 
     points: float
     likeness: float
     share: float
     shift_map: Float64Array
+    are_strips: bool
 
     @property
     def fit(self) -> float:
@@ -177,12 +184,17 @@ def _neighbours(start: Cloud, come: Sequence[Cloud], boxes: Float64Array) -> lis
 
     Distances are measured only to the objects whose box, of (N, 2, 2) boxes, is near.
     """
-    tree, (low, high) = cKDTree(start.few[:, :2]), _box_xy(start)
+    tree, (low, high) = cKDTree(start.few), _box_xy(start)
     apart_m = np.linalg.norm(np.maximum(np.maximum(boxes[:, 0] - high, low - boxes[:, 1]), 0.0), axis=1)
     gaps_m = np.full(len(come), np.inf)
     for a in np.flatnonzero(apart_m < 2 * _BESIDE_M).tolist():
-        gaps_m[a] = np.min(tree.query(come[a].few[:, :2])[0])
+        gaps_m[a] = np.min(tree.query(come[a].few)[0])
     return [a for a in np.argsort(gaps_m, kind="stable").tolist() if gaps_m[a] < _BESIDE_M][:_MOST_TRIED]
+
+
+def _misfits(start: Cloud, extents: Float64Array) -> Float64Array:
+    """Return the largest difference between the log extents of an object and (..., 3) others."""
+    return np.asarray(np.abs(start.log_extents - extents).max(axis=-1))
 
 
 def _partners_elsewhere(start: Cloud, come: Sequence[Cloud], extents: Float64Array, with_nearest: bool) -> list[int]:
@@ -190,7 +202,7 @@ def _partners_elsewhere(start: Cloud, come: Sequence[Cloud], extents: Float64Arr
 
     At most `_MOST_TRIED` of each; the most similar first.
     """
-    misfits = np.abs(start.log_extents - extents).max(axis=1)
+    misfits = _misfits(start, extents)
     similar = [a for a in np.argsort(misfits, kind="stable").tolist() if misfits[a] <= np.log(_FAR_FACTOR)]
     chosen = similar[:_MOST_TRIED]
     if with_nearest:
@@ -205,7 +217,7 @@ def _partners_in_part(start: Cloud, extents: Float64Array) -> list[int]:
 
     At most `_MOST_TRIED`; the most similar first.
     """
-    misfits = np.abs(start.log_extents - extents).max(axis=1)
+    misfits = _misfits(start, extents)
     in_part = (misfits > np.log(_FAR_FACTOR)) & (misfits <= np.log(_PART_FACTOR))
     return [a for a in np.argsort(misfits, kind="stable").tolist() if in_part[a]][:_MOST_TRIED]
 
@@ -244,6 +256,8 @@ def _judge(
     if excess <= 0.0 or min(shares) < _EITHER_SHARE or likeness < least_likeness:
         return None
     together = np.concatenate([start.points, transform(invert(end_T_start), end.points)])
-    centre = upright_box(together)[0][:3, 3]
+    map_T_box, size_m = upright_box(together)
+    centre = map_T_box[:3, 3]
     shift = transform(end_T_start, centre[None])[0] - centre
-    return _Match(excess * min(len(start.points), len(end.points)), likeness, max(shares), shift)
+    are_strips = bool(np.linalg.norm(shift) < _WHOLE_LENGTH * size_m[0])
+    return _Match(excess * min(len(start.points), len(end.points)), likeness, max(shares), shift, are_strips)

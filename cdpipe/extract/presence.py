@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array, Int64Array, travelled_m
 from cdpipe.core.geometry.planes import fit_plane, is_level_sheet
-from cdpipe.core.geometry.voxel import cell_means
+from cdpipe.core.geometry.voxel import cell_keys, cell_means
 from cdpipe.extract.crops import SESSIONS
 from cdpipe.extract.objects import PointGroup
 from cdpipe.extract.people import is_person
@@ -51,10 +51,10 @@ _FARTHEST_M = 60.0
 # they hit it. In five validation pairs of `dynamic/wide`, `dust/haul` and `dust/narrow` 0.05 times at most for changed
 # objects, over 0.24 times for nearly all parts of machines; of these 0.81 or more lies beside what was dropped.
 _BESIDE_M, _MOST, _PART = 1.0, 0.5, 0.12
-# Floor: thickness of the sheet, reach of the map around it, fewest points there, and height above it. Floor that is dry
-# in one session (`water/null` 10020, `water/narrow` 10013) is 0.04 to 0.07 m thick and lies 0.02 to 0.06 m lower. Of 47
-# objects that changed the flattest, 0.10 to 0.14 m thick, stand 0.05 m and more above it.
-_SHEET_M, _AROUND_M, _LEAST_AROUND, _ABOVE_M = 0.1, 0.6, 20, 0.02
+# Floor: thickness of the sheet, reach of the map around it, its columns, fewest points there, height above it. Floor
+# that is dry in one session (`water/null` 10020, `water/narrow` 10013) is 0.04 to 0.07 m thick and lies 0.02 to 0.06 m
+# lower. Of 47 objects that changed the flattest, 0.10 to 0.14 m thick, stand 0.05 m and more above it.
+_SHEET_M, _AROUND_M, _COLUMN_M, _LEAST_AROUND, _ABOVE_M = 0.1, 0.6, 0.2, 20, 0.02
 
 
 def keep_what_stands(merged: MergedMaps, objects: list[PointGroup], config: ExtractConfig) -> list[PointGroup]:
@@ -76,7 +76,10 @@ def keep_what_stands(merged: MergedMaps, objects: list[PointGroup], config: Extr
 
 
 def is_floor(returns_odom: Float64Array, around_odom: Float64Array) -> bool:
-    """Return whether (N, 3) returns of an object are a level sheet, no higher than its session's (Q, 3) map around."""
+    """Return whether (N, 3) returns of an object are a level sheet, no higher than the floor of a (Q, 3) map around.
+
+    Floor is what lies lowest in each column of the map: what stands beside the object tells nothing of it.
+    """
     if not is_level_sheet(returns_odom, _SHEET_M):
         return False
     low, high = returns_odom.min(axis=0) - _AROUND_M, returns_odom.max(axis=0) + _AROUND_M
@@ -85,7 +88,11 @@ def is_floor(returns_odom: Float64Array, around_odom: Float64Array) -> bool:
     if len(around) < _LEAST_AROUND:
         return False
     centre, normal = fit_plane(returns_odom)
-    return bool(np.median((around - centre) @ normal) > -_ABOVE_M)
+    over_m = (around - centre) @ normal
+    _, column = np.unique(cell_keys(around * (1.0, 1.0, 0.0), _COLUMN_M), return_inverse=True)
+    lowest_m = np.full(column.max() + 1, np.inf)
+    np.minimum.at(lowest_m, column, over_m)
+    return bool(np.median(over_m[over_m < lowest_m[column] + _SHEET_M]) > -_ABOVE_M)
 
 
 def _find_floor(point_map: PointMap, objects: Mapping[int, PointGroup]) -> set[int]:

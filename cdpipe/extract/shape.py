@@ -15,6 +15,8 @@ from cdpipe.core.geometry.voxel import cell_keys
 
 # The ground at a place is the median over this many nearest columns, robust against a false return below the floor.
 _GROUND_COLUMNS = 5
+# Height from which an object has sides, and largest gap below one that stands.
+_SIDES_M, _FOOT_M = 0.2, 0.3
 
 
 def upright_box(points: Float64Array) -> tuple[Float64Array, Float64Array]:
@@ -47,6 +49,9 @@ def column_volume_m3(
 ) -> float:
     """Return the volume between an object and the ground, or the roof that it hangs from; 0 without a footprint.
 
+    An object with sides, farther above the ground than it is high, hangs free or on a wall: the volume is measured down
+    to its own lowest point. Of a surface without sides nobody knows how deep it reaches.
+
     Args:
         points_map: (P, 3) points of the object, map frame, metres; P is at least 1.
         other_map: (Q, 3) points of the other session below and around it; if empty, the floor is level at the
@@ -58,7 +63,11 @@ def column_volume_m3(
     if np.median(ground_heights(other_map, columns, ground_m) - columns[:, 2]) > 0:  # upside down
         points_map, other_map = points_map * _UPSIDE_DOWN, other_map * _UPSIDE_DOWN
         columns = _columns(points_map, column_m)
-    heights = np.maximum(columns[:, 2] - ground_heights(other_map, columns, ground_m), 0.0)
+    lowest_m, high_m = points_map[:, 2].min(), np.ptp(points_map[:, 2])
+    ground = ground_heights(other_map, columns, ground_m) if len(other_map) else np.full(len(columns), lowest_m)
+    if high_m >= _SIDES_M and lowest_m - np.median(ground) > max(high_m, _FOOT_M):
+        ground = np.full(len(columns), lowest_m)
+    heights = np.maximum(columns[:, 2] - ground, 0.0)
     try:
         triangles = Delaunay(columns[:, :2]).simplices
     except (QhullError, ValueError):

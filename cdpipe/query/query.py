@@ -89,15 +89,15 @@ def find_regions(
 
 
 def _find_ends(positions: Float64Array, others: Float64Array, config: QueryConfig) -> Int64Array:
-    """Return which of (K, 3) keyframes, their first or last, lie at the first or last of (L, 3) of the other session.
+    """Return which of (K, 3) keyframes, their first or last, the other session with its (L, 3) came near.
 
-    There both turned back, before a face for example. A sphere descriptor sees 2 m beyond such a keyframe, its region
-    reaches farther, and no other keyframe does. So it is always looked at.
+    A sphere descriptor sees 2 m beyond such a keyframe, its region reaches farther, and no other keyframe does. So it
+    is always looked at.
     """
     if not len(positions) or not len(others):
         return np.zeros(0, dtype=np.int64)
     outer = np.unique([0, len(positions) - 1])
-    apart_m = np.linalg.norm(positions[outer, None] - others[[0, -1]], axis=2).min(axis=1)
+    apart_m = np.linalg.norm(positions[outer, None] - others, axis=2).min(axis=1)
     return np.asarray(outer[apart_m <= config.max_pair_m], dtype=np.int64)
 
 

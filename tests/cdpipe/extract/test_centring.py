@@ -57,6 +57,14 @@ def test_what_is_too_far_apart_for_one_sphere_is_centred_without_the_smallest_ob
     np.testing.assert_allclose(found.centres_map, [(-4.1, 0, 0)], atol=1e-9)
 
 
+def test_objects_beyond_the_reported_regions_report_no_more_regions_than_asked_for() -> None:
+    proposed = regions((0, 0), (3, 0), (30, 0), n_reported=1)
+    far = [group(-3.9), group(4.3, region=0)]  # the second is followed out of the sphere, and lies in the next one
+    assert centre_regions(proposed, far)[0].is_reported.tolist() == [True, True, False]
+    for most, expected in ((2, [True, True, False]), (1, [True, False, False])):
+        assert centre_regions(proposed, far, most=most)[0].is_reported.tolist() == expected
+
+
 def test_only_the_part_of_an_object_near_the_sphere_counts() -> None:
     wall = np.column_stack([np.linspace(3.0, 30.0, 271), np.zeros(271), np.zeros(271)])
     found, _ = centre_regions(regions((0, 0)), [PointGroup("before", np.arange(271), wall, 0)])

@@ -186,6 +186,21 @@ def test_neighbours_that_share_just_enough_points_but_are_hardly_alike_are_two_o
     assert len(moves([noisy(post, "a")], [noisy(shifted(post, 0.3, 0.1), "b")])) == 1
 
 
+@pytest.mark.parametrize("gap_m", [0.3, 0.9, 1.4])
+def test_a_tall_box_did_not_become_the_cube_beside_it(gap_m: float) -> None:
+    tall, cube = box((0.6, 0.6, 1.0), "flr"), shifted(box((0.5, 0.5, 0.5), "flr"), 0.6 + gap_m)
+    ground = face((-4, -4, 0), (8, 4, 0))
+    objects = [noisy(tall, "tall")], [noisy(cube, "cube")]
+    assert find_moves(*objects, lambda pairs: [(ground, ground)] * len(pairs)) == []
+    assert len(moves([noisy(tall, "tall")], [noisy(shifted(tall, 0.6 + gap_m), "again")])) == 1
+
+
+def test_of_two_alike_the_one_on_another_level_is_farther() -> None:
+    above = barrel() + np.array([0.8, 0.0, 12.0])
+    (move,) = moves([barrel()], [above, shifted(barrel(), 3.0)])
+    np.testing.assert_allclose(move.displacement_map, [3.0, 0.0, 0.0], atol=0.05)
+
+
 def test_what_lies_on_what_stands_around_is_not_what_was_put_beside_it() -> None:
     # a load off the flank of a heap would lie on the rest of it; the chair put there would not
     heap = face((0, 0, 0), (2.0, 3.0, 0)) @ np.array([[1, 0, 0.6], [0, 1, 0], [0, 0, 0]])

@@ -332,3 +332,17 @@ def test_floor_is_a_level_sheet_no_higher_than_what_is_around(
     around = draw.uniform((-3.0, -3.0, -0.02), (3.0, 3.0, 0.02), (4000, 3)) @ turn.T
     assert is_floor(sheet, around) == is_bare
     assert not is_floor(sheet, around[:0])
+
+
+BESIDE: tuple[Box, ...] = (((1.2, 1.5, 0.0), (1.95, 2.7, 1.5)), ((2.85, 1.5, 0.0), (3.6, 2.7, 1.5)))
+
+
+@pytest.mark.parametrize(
+    ("low", "kept"),
+    [
+        (((3.8, 3.2, 0.0), (5.0, 4.0, 0.14)), ()),  # in a corner
+        (((2.0, 1.5, 0.0), (2.8, 2.7, 0.1)), BESIDE),
+    ],
+)
+def test_a_low_thing_in_a_corner_or_between_crates_is_no_floor(low: Box, kept: tuple[Box, ...]) -> None:
+    assert len(cut(scanned(kept, 1), scanned((*kept, low), 2), centres=((3.5, 2.5, 0.5),))) == 1

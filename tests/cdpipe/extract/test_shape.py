@@ -97,6 +97,16 @@ def test_what_hangs_is_measured_up_to_the_roof() -> None:
     assert column_volume_m3(sheet(0.5, 0.7), sheet(1.5, 1.0)) == pytest.approx(0.9**2 * 0.3, rel=0.05)
 
 
+def test_what_hangs_in_the_air_or_on_a_wall_is_measured_down_to_itself() -> None:
+    size = (1.0, 0.6, 0.4)
+    hung = box_faces(size, True) + np.array([0.0, 0.0, 1.2])
+    wall = np.stack(np.meshgrid(np.linspace(-2, 2, 41), [0.31], np.linspace(0.3, 2.6, 24)), axis=-1).reshape(-1, 3)
+    for other in (NOTHING, sheet(2.0), wall):
+        assert column_volume_m3(hung, other) == pytest.approx(np.prod(size), rel=0.1)
+    # of a lid alone nobody knows how deep it reaches: to the floor
+    assert column_volume_m3(sheet(0.5, 0.8), sheet(2.0)) == pytest.approx(0.9**2 * 0.8, rel=0.05)
+
+
 def test_what_was_loaded_away_is_measured_down_to_what_is_left() -> None:
     # a block 2 m x 2 m x 1 m of which a wedge is gone: nothing at y = -1, all of it at y = +1
     taken, left = sheet(1.0, 1.0), sheet(1.0, 1.0)

@@ -212,7 +212,7 @@ def test_scores_of_spheres_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found.scores.max() == 8.0
 
 
-def test_where_both_sessions_turned_back_is_always_looked_at() -> None:
+def test_an_end_that_the_other_session_came_near_is_always_looked_at() -> None:
     def ends(x_m: list[float], others_m: list[float]) -> list[int]:
         places = (np.column_stack([each, np.zeros((len(each), 2))]) for each in (x_m, others_m))
         return _find_ends(*places, QueryConfig(max_pair_m=2.0)).tolist()
@@ -220,7 +220,8 @@ def test_where_both_sessions_turned_back_is_always_looked_at() -> None:
     way = [0.0, 1.0, 2.0, 3.0, 4.0]
     assert ends(way, [-1.5, 2.0, 5.5]) == [0, 4]
     assert ends(way, [5.5, 2.5]) == [4]  # driven the other way, and not as far
-    assert ends(way, [9.0, 2.0, -3.0]) == []
+    assert ends(way, [9.0, 5.5, 2.0, -0.5, -3.0]) == [0, 4]  # driven on at both
+    assert ends(way, [9.0, 6.5, -2.5]) == []
     assert ends([1.0], [0.0]) == [0]
     assert ends([], way) == ends(way, []) == []
 
