@@ -96,9 +96,12 @@ def _start_mistakes(scenario: Scenario) -> Iterator[Mistake]:
         if plan.trajectory is not None:
             continue
         left_m = route_length_m(scenario.tunnel, plan)
-        if left_m < scenario.of(name).platform.scan_spacing_m:
+        if left_m <= 0:
             whole_m = left_m + plan.start_m + plan.end_m
             yield (name, "start_m"), f"start_m and end_m leave nothing of the route, which is {whole_m:.1f} m"
+        elif left_m < scenario.of(name).platform.scan_spacing_m:
+            owner: Key = (name, "platform") if plan.platform else ("platform",)
+            yield (*owner, "scan_spacing_m"), f"is longer than {name}'s route, {left_m:.1f} m without start_m and end_m"
 
 
 def _room_mistakes(scenario: Scenario) -> Iterator[Mistake]:

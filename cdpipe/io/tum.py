@@ -20,6 +20,8 @@ MOST_BYTES = 100_000_000  # two hours at 200 Hz
 _MOST_STAMP_S = 9e9  # of Unix time until the year 2255; as nanoseconds it fits into 64 bits
 # Poses farther apart than this say nothing about the columns between them.
 _LONGEST_GAP_S = 1.0
+# Poses this share of a revolution apart count as one a revolution: their stamps jitter.
+_NEARLY = 0.9
 
 
 def read_tum(path: Path) -> tuple[Float64Array, tuple[int, ...]]:
@@ -70,6 +72,30 @@ def motion_through(rows: Float64Array, first_s: float) -> Motion:
     return make_motion(rows[:, 0] - first_s, way_m, rows[:, 1:4], Rotation.from_quat(rows[:, 4:]))
 
 
+def motion_beyond(rows: Float64Array, first_s: float, revolution_s: float) -> Motion:
+    """Return the movement through TUM rows (N, 8), its time counted from the stamp `first_s`.
+
+    Beyond either end it goes on as it was, on average, between the end pose and the next one inside that is 0.9
+    `revolution_s` or more away: over the few milliseconds between the poses of a dense file, their noise is a wrong
+    speed.
+    """
+    ends = _row_beyond(rows, revolution_s), _row_beyond(rows[::-1], revolution_s)
+    return motion_through(np.concatenate([ends[0], rows, ends[1]]), first_s)
+
+
+def _row_beyond(rows: Float64Array, revolution_s: float) -> Float64Array:
+    """Return the row (1, 8) that continues rows (N, 8) before the first: the one a revolution inside, mirrored at it.
+
+    Where that is the second row, or there is no third, return no row, (0, 8): the first two rows say the same.
+    """
+    inside = min(int(np.searchsorted(np.abs(rows[:, 0] - rows[0, 0]), _NEARLY * revolution_s)), len(rows) - 1)
+    if inside < 2:
+        return rows[:0]
+    end, inner = rows[0], rows[inside]
+    turn, inner_turn = Rotation.from_quat(end[4:]), Rotation.from_quat(inner[4:])
+    return np.concatenate([2 * end[:4] - inner[:4], (turn * inner_turn.inv() * turn).as_quat()])[None]
+
+
 def motion_along(path: Path, first_ns: int, last_ns: int, slack_s: float, rows: Float64Array | None = None) -> Motion:
     """Return the movement of a trajectory, its time counted from `first_ns`.
 
@@ -77,7 +103,8 @@ def motion_along(path: Path, first_ns: int, last_ns: int, slack_s: float, rows: 
         path: The file, TUM unless its poses are given; stamps in seconds of the same clock as `first_ns`.
         first_ns: Time of the first column that needs a pose.
         last_ns: Time of the last one.
-        slack_s: How far the poses may end short of either; there the movement goes on as it was.
+        slack_s: How far the poses may end short of either, 1.5 revolutions; there the movement goes on as it was over
+            the nearest revolution.
         rows: (N, 8) its rising stamps and poses, as a TUM file has them, where it is none.
 
     Raises:
@@ -99,7 +126,7 @@ def motion_along(path: Path, first_ns: int, last_ns: int, slack_s: float, rows: 
             f"{path}:{numbers[gap + 1]}: no pose for {steps_s[gap]:.2f} s before it, in the middle of the recording: "
             f"at most {_LONGEST_GAP_S:g} s can be bridged"
         )
-    return motion_through(rows, first_ns / 1e9)
+    return motion_beyond(rows, first_ns / 1e9, slack_s / 1.5)
 
 
 def write_tum(path: Path, stamps_s: Float64Array, poses: Float64Array) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -19,7 +19,7 @@ class Sensor(GrownSettings):
     newer: ClassVar[frozenset[str]] = frozenset({"returns", "retroreflectors", "glass"})
 
     profile: str = "os1-32-nominal"
-    mode: Annotated[str, Field(pattern=r"^\d+x\d+$")] = "1024x10"
+    mode: Annotated[str, Field(pattern=r"^\d+x\d+$")] | None = None  # left out: the profile's own, 1024x10 if shipped
     rolling_scan: bool = True  # a pose per column; off: the sensor stands still during each revolution
     range_noise: bool = True  # by range and by the strength of the return
     dropouts: bool = True  # weak returns are lost: reflectivity, incidence, range
@@ -36,6 +36,13 @@ class Sensor(GrownSettings):
     def n_returns(self) -> int:
         """How many returns of a beam are recorded at most."""
         return 2 if self.returns == "dual" else 1
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_usual_mode(cls, given: Any) -> Any:
+        """Write down the mode of a shipped profile, as scenarios always did; a file's own is read with the file."""
+        is_shipped = isinstance(given, dict) and not str(given.get("profile", "")).endswith(".json")
+        return {"mode": "1024x10", **given} if is_shipped else given
 
     @model_validator(mode="after")
     def _sees_something(self) -> Sensor:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array, Int64Array, stream
 from cdpipe.core.geometry.motion import Motion, make_motion
-from cdpipe.io.tum import motion_through, read_trajectory
+from cdpipe.io.tum import motion_beyond, read_trajectory
 from cdpipe.mapping.poses.odometry import estimate_motion
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Odometry
@@ -162,7 +162,8 @@ def read_odometry(
 ) -> Motion:
     """Return the movement of a TUM file of odom_T_sensor, interpolated in time.
 
-    Stamps are seconds of the session's clock, which is 0 at the first column of its first revolution.
+    Stamps are seconds of the session's clock, which is 0 at the first column of its first revolution. Beyond the file's
+    ends the movement goes on as it was over the nearest revolution.
 
     Args:
         path: The file.
@@ -192,7 +193,7 @@ def read_odometry(
             f"before it, and the session has a revolution at {middle_s[bad]:.3f} s: give a pose for each revolution, "
             f"or one every {_LONGEST_GAP_S:g} s at least"
         )
-    return motion_through(rows, middle_s[0] - revolution_s[0])
+    return motion_beyond(rows, middle_s[0] - revolution_s[0], slack_s)
 
 
 def register_scans(

@@ -137,7 +137,8 @@ def _drive_route(
     path = plan_path(world, scenario, seed, session, is_wary)
     true = ride(path, world.fixed, scene.caster, scenario, seed, session)
     try:
-        check_clearance(world, scenario, session, true.way_m, true.points)
+        on_path = np.searchsorted(true.way_m, path.distance_m)  # a walk has further samples in between
+        check_clearance(world, scenario, session, path.distance_m, true.points[on_path])
     except ScenarioError as too_near:
         if is_wary:
             raise

@@ -89,7 +89,7 @@ def test_what_a_session_leaves_out_is_the_scenarios_and_a_dump_is_read_as_it_was
         ),
         (["after.platform.clearance_m=3"], "after.platform.clearance_m = 3: leaves the platform no room"),
         (["after.platform.sensor_height_m=9"], "after.platform.sensor_height_m = 9: the sensor would be above"),
-        (["after.platform.scan_spacing_m=500"], "after.start_m"),
+        (["after.platform.scan_spacing_m=500"], "after.platform.scan_spacing_m = 500"),
         (["after.sensor.profile=nowhere.json"], "after.sensor.profile = 'nowhere.json': no such file"),
     ],
 )

@@ -421,6 +421,16 @@ def test_worlds_that_cannot_be_driven_are_refused(tmp_path: Path) -> None:
     )
 
 
+def test_scans_farther_apart_than_the_route_is_long_are_a_mistake_of_their_spacing(tmp_path: Path) -> None:
+    # the route is 21.18 m, and after leaves 2 m out
+    text = WORLD + "platform: {scan_spacing_m: 20}\n"
+    (line,) = mistakes_of(written(tmp_path, text))
+    assert line.startswith(":21: platform.scan_spacing_m = 20: ") and "after's route, 19.2 m" in line
+    own = WORLD.replace("start_m: 2", "platform: {scan_spacing_m: 30}")
+    (line,) = mistakes_of(written(tmp_path, own))
+    assert line.startswith(":20: after.platform.scan_spacing_m = 30: ") and "after's route, 21.2 m" in line
+
+
 def test_route_length_by_hand(tmp_path: Path) -> None:
     scenario = load_scenario(written(tmp_path, WORLD.replace("start_m: 2", "start_m: 2, end_m: 3")), 0)
     assert route_length_m(scenario.tunnel, scenario.before) == 10 + 125**0.5

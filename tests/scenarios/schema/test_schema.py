@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 import pytest
 from pydantic import ValidationError
 
-from scenarios.schema import FITTED_WALK, GAITS, MeshFile, Odometry, Platform, Prop, Sensor, SessionPlan
+from cdpipe.sensor.ouster import load_profile, profile_names
+from scenarios import check_scenario
+from scenarios.schema import FITTED_WALK, GAITS, MeshFile, Odometry, Platform, Prop, Scenario, Sensor, SessionPlan
+from sim.drive.trajectory import load_sensor
 
 
 @pytest.mark.parametrize(
@@ -76,3 +81,27 @@ def test_the_dump_of_an_older_scenario_has_no_key_that_came_later() -> None:
     }
     assert not {"gait", "mount_yaw_deg", "mount_pitch_deg"} & Platform().model_dump().keys()
     assert Platform(mount_yaw_deg=90).model_dump()["mount_yaw_deg"] == 90
+
+
+def test_a_sensor_without_a_mode_has_its_profile_s_own(tmp_path: Path) -> None:
+    file = tmp_path / "own.json"
+    file.write_text(json.dumps(load_profile("os1-32-u0", "2048x10").to_json()))
+    sensors = {
+        f"sensor: {{profile: {file}}}": "2048x10",
+        f"sensor: {{profile: {file}, mode: 512x20}}": "512x20",
+        "sensor: {profile: os1-32-u0}": "1024x10",
+        f"sensor: {{profile: {file}}}\nafter: {{sensor: {{profile: os1-32-u0}}}}": "2048x10",
+    }
+    for told, mode in sensors.items():
+        (tmp_path / "world.yaml").write_text(f"extends: smoke/one_box\n{told}\n")
+        scenario = check_scenario(str(tmp_path / "world.yaml"))
+        assert load_sensor(scenario, "before").mode == mode
+        again = Scenario.model_validate(scenario.model_dump(mode="json"))  # as a pair's truth keeps it
+        assert again == scenario and load_sensor(again, "before").mode == mode
+    assert load_sensor(scenario, "after").mode == load_sensor(again, "after").mode == "1024x10"
+
+
+def test_the_mode_of_a_shipped_profile_is_written_down() -> None:
+    for name in profile_names():
+        assert Sensor(profile=name).model_dump()["mode"] == load_profile(name).mode == "1024x10"
+    assert Sensor().model_dump()["mode"] == "1024x10"

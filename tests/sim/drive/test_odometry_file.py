@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
+from cdpipe.io.tum import motion_through
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Odometry, Platform, Scenario, SessionPlan
 from sim.drive.odometry import read_odometry
@@ -46,6 +47,42 @@ def test_one_pose_for_each_revolution_is_enough_however_far_they_are_apart(
     stamps_s = middle_s - 7.0 + sensor.column_offsets_ns()[sensor.width // 2] / 1e9
     found = poses(written(tmp_path / "own.tum", stamps_s), sensor, middle_s)
     np.testing.assert_allclose(found[:, 0, 3], stamps_s, atol=1e-12)
+
+
+def test_an_open_end_goes_on_as_over_the_revolution_beside_it_not_as_between_two_noisy_poses(
+    tmp_path: Path, sensor: SensorMetadata
+) -> None:
+    middle_s = np.array([7.0, 8.5, 10.0])  # the session's clock: columns from 0.0 to 3.1 s
+    path = written(tmp_path / "own.tum", np.arange(0.09, 3.011, 0.005))
+    rows = np.loadtxt(path)
+    rows[[1, -2], 2] += 0.003  # 5 ms from the ends: without care, 0.003 / 0.005 * 0.09 = 54 mm at the first column
+    rows[[1, -2], 4:] = (Rotation.from_rotvec([0.001, 0, 0]) * Rotation.from_quat(rows[[1, -2], 4:])).as_quat()
+    np.savetxt(path, rows)
+    stamps_s = np.array([[0.0, 0.04], [3.05, 3.09]])
+    found = read_odometry(path, middle_s, sensor.column_offsets_ns(), "after").poses(stamps_s + 6.95)
+    np.testing.assert_allclose(found[..., :3, 3], stamps_s[..., None] * [1.0, 0.0, 0.0], atol=1e-9)
+    turns = Rotation.from_euler("z", 0.1 * stamps_s.reshape(-1, 1)).as_matrix()
+    np.testing.assert_allclose(found[..., :3, :3].reshape(-1, 3, 3), turns, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "stamps_s",
+    [
+        np.arange(0.05, 3.1, 0.1) + 0.004 * np.arange(31) % 0.009,
+        np.arange(-0.2, 3.4, 0.005),
+        np.array([0.05, 1.0, 1.5]),
+    ],
+    ids=["one a revolution", "dense and whole", "sparse"],
+)
+def test_a_file_that_is_sparse_or_whole_has_the_poses_of_its_lines_to_the_bit(
+    tmp_path: Path, sensor: SensorMetadata, stamps_s: Float64Array
+) -> None:
+    path = written(tmp_path / "own.tum", stamps_s)
+    middle_s = np.array([7.0, 7.5, 8.5])
+    found = read_odometry(path, middle_s, sensor.column_offsets_ns(), "after")
+    plain = motion_through(np.loadtxt(path), 0.05 - 7.0)
+    column_s = np.linspace(6.95, 8.55, 999)
+    np.testing.assert_array_equal(found.poses(column_s), plain.poses(column_s))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array, transform
+from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Odometry, Platform, Scenario, SessionPlan
+from sim.drive import trajectory
+from sim.scene import build_world
 from sim.session.simulate import HeldPair, simulate_in_memory
 
 ODOMETRY = Odometry(source="random-walk")
@@ -61,3 +64,19 @@ def test_true_poses_put_the_returns_of_every_platform_on_the_same_walls(
     sessions = pair.sessions
     assert sessions["before"].world_T_sensor.shape == sessions["before"].session.odom_T_sensor.shape
     assert pair.truth.scenario["platform"].items() >= platform.items()
+
+
+def test_the_clearance_of_a_walk_is_checked_at_the_same_places_at_every_speed(
+    make_scenario: Callable[..., Scenario], sensor: SensorMetadata, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checked = []
+    monkeypatch.setattr(trajectory, "check_clearance", lambda *told: checked.append(told[-2:]))
+    still = dict.fromkeys(("bob_m", "sway_m", "pitch_deg", "roll_deg", "yaw_deg"), 0.0)
+    for speed_mps in (2.0, 0.2):
+        told = {"kind": "handheld", "speed_mps": speed_mps, "scan_spacing_m": 2.0, "gait": still}
+        scenario = make_scenario(platform=Platform.model_validate(told))
+        trajectory.plan_trajectory(build_world(scenario, 1), scenario, sensor, 1, "before")
+    (fast_m, fast), (slow_m, slow) = checked
+    assert np.diff(slow_m).max() < 0.06
+    np.testing.assert_array_equal(slow_m, fast_m)
+    np.testing.assert_array_equal(slow, fast)

@@ -163,7 +163,7 @@ def test_who_walks_bobs_and_pitches_once_a_step_and_rolls_sways_and_turns_once_a
     platform = Platform.model_validate({"kind": kind, "sensor_height_m": 1.2, "tilt_deg": 0, "gait": gait})
     motion = driven(make_scenario, floor_of(lambda along, _: 0.0 * along), platform)
     yaw, pitch, roll = np.rad2deg(angles(motion).T)
-    across_m = (motion.points[:, :2] - straight().points[:, :2]) @ LEFT
+    across_m = motion.points[:, :2] @ LEFT
     for values, amplitude, hertz in (
         (motion.points[:, 2] - 1.2, 0.04, step_hz),
         (pitch, 0.6, step_hz),
@@ -176,6 +176,40 @@ def test_who_walks_bobs_and_pitches_once_a_step_and_rolls_sways_and_turns_once_a
         assert np.linalg.norm(found) == pytest.approx(amplitude, rel=0.1)
         # the mast of a legged robot leans with it, and that moves its sensor by up to 2 cm more
         assert np.abs(values - waves @ found).max() < 0.1 * amplitude + (0.03 if kind == "legged" else 0.0)
+
+
+@pytest.mark.parametrize(("kind", "step_hz"), [("handheld", 1.5), ("legged", 2.5)])
+def test_a_slow_walk_keeps_its_amplitudes(make_scenario: Callable[..., Scenario], kind: str, step_hz: float) -> None:
+    gait = {"step_hz": step_hz, "bob_m": 0.04, "sway_m": 0.0, "pitch_deg": 0.6, "roll_deg": 0.4, "yaw_deg": 0.8}
+    level = floor_of(lambda along, _: 0.0 * along)
+    for speed_mps in (1.0, 0.5, 0.15):
+        told = {"kind": kind, "sensor_height_m": 1.2, "tilt_deg": 0, "gait": gait, "speed_mps": speed_mps}
+        motion = driven(make_scenario, level, Platform.model_validate(told))
+        assert np.isin(straight().distance_m, motion.way_m).all()
+        time_s = np.arange(4.0, 12.0, 0.01)  # between the samples, too: 20 steps of a legged robot, 12 of a person
+        points, quaternions = motion.sample(time_s)
+        np.testing.assert_allclose(points[:, :2] @ FORWARD, speed_mps * time_s, atol=0.02)
+        yaw, pitch, roll = np.rad2deg(Rotation.from_quat(quaternions).as_euler("ZYX").T)
+        for values, amplitude, hertz in (
+            (points[:, 2] - 1.2, 0.04, step_hz),
+            (pitch, 0.6, step_hz),
+            (roll, 0.4, step_hz / 2),
+            (yaw - np.rad2deg(HEADING), 0.8, step_hz / 2),
+        ):
+            # orthogonal over whole periods; (sin(pi / 16) / (pi / 16))^2 = 0.987
+            found = 2 * np.mean(values * np.exp(2j * np.pi * hertz * time_s))
+            assert 0.986 * amplitude < abs(found) < 1.001 * amplitude, speed_mps
+
+
+def test_a_walk_that_is_fast_enough_has_no_further_samples_and_one_of_weeks_is_refused(
+    make_scenario: Callable[..., Scenario],
+) -> None:
+    level = floor_of(lambda along, _: 0.0 * along)
+    # 0.05 m at 2.1 m/s are 23.8 ms; a sixteenth of a step at 2.6 Hz is 24.04 ms
+    fast, slow = (Platform.model_validate({"kind": "legged", "speed_mps": speed}) for speed in (2.1, 1e-5))
+    np.testing.assert_array_equal(driven(make_scenario, level, fast).way_m, straight().distance_m)
+    with pytest.raises(ScenarioError, match=r"before: the walk takes 2e\+06 s: .*: walk faster"):
+        driven(make_scenario, level, slow)
 
 
 def test_a_hand_is_level_on_a_slope_and_a_legged_robot_is_not(make_scenario: Callable[..., Scenario]) -> None:

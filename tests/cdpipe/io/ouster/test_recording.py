@@ -263,6 +263,18 @@ def test_a_trajectory_may_have_gaps_before_and_after_the_recording(tmp_path: Pat
     np.testing.assert_allclose(motion.poses(np.array(0.2)), odom_T_sensor(0.2), atol=1e-5)
 
 
+def test_a_trajectory_goes_on_beyond_its_ends_as_over_the_nearest_revolution(tmp_path: Path) -> None:
+    tum = write_tum(tmp_path / "t.tum", 0.09, 0.215, 100.0)  # the last pose at 0.21 s
+    rows = np.loadtxt(tum)
+    rows[[1, -2], 3] += 0.003  # a slope over 10 ms, carried on for 0.09 s, would be 27 mm off
+    np.savetxt(tum, rows, fmt="%.9f")
+    motion = motion_along(tum, START_NS, START_NS + 300_000_000, 0.15)
+    inside, outside = odom_T_sensor(0.18)[:3, 3], motion.poses(np.array(0.0))[:3, 3]
+    np.testing.assert_allclose(outside, 2 * odom_T_sensor(0.09)[:3, 3] - inside, atol=1e-6)
+    inside, outside = odom_T_sensor(0.12)[:3, 3], motion.poses(np.array(0.3))[:3, 3]
+    np.testing.assert_allclose(outside, 2 * odom_T_sensor(0.21)[:3, 3] - inside, atol=1e-6)
+
+
 def test_a_trajectory_whose_stamps_do_not_rise_is_named(tmp_path: Path) -> None:
     (tmp_path / "t.tum").write_text("# x\n0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
     assert "t.tum:4: " in said(lambda: motion_along(tmp_path / "t.tum", 0, 10, 0.1))
