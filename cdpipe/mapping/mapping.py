@@ -81,12 +81,17 @@ def _accumulate(source: ScanSource, keyframe_scans: Int64Array, config: MapConfi
 
 
 def choose_keyframes(odom_T_sensor: Float64Array, spacing_m: float) -> Int64Array:
-    """Return the (K,) indices of the scans that are keyframes: the first, and one per `spacing_m` of path."""
-    travelled = travelled_m(odom_T_sensor)
+    """Return the (K,) indices of the scans that are keyframes: the first, and one per `spacing_m` of path.
+
+    A standing sensor jitters, which makes path: no keyframe is nearer to the one before it than half the spacing.
+    """
+    travelled, positions = travelled_m(odom_T_sensor), odom_T_sensor[:, :3, 3]
     chosen = [0]
     for index, path_m in enumerate(travelled):
         # a relative slack of 1e-6 for the rounding of summed steps
-        if path_m - travelled[chosen[-1]] >= spacing_m * (1 - 1e-6):
+        if path_m - travelled[chosen[-1]] < spacing_m * (1 - 1e-6):
+            continue
+        if np.linalg.norm(positions[index] - positions[chosen[-1]]) >= spacing_m / 2:
             chosen.append(index)
     return np.array(chosen, dtype=np.int64)
 

@@ -17,9 +17,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert
 from cdpipe.core.progress import Progress, report_nothing
@@ -31,9 +33,12 @@ from cdpipe.model.types import PosedScan, ScanSource, WrappedScans
 _BLOCK_M, _AROUND_M = 4.0, 6.0
 # A scan is followed in the map of the scans within this way behind it, which is made anew once per metre.
 _BEHIND_M, _RENEWED_M = 10.0, 1.0
-# Scans agree already if a sweep moves nine of ten by no more than this: 0.4 to 0.6 cm at constant drift, 4 cm with
-# KISS-ICP (validation tunnels of `narrow` and `wide`).
-_AGREE_M = 0.015
+# Scans agree already if a sweep by halves moves nine of ten by no more than this, turns included, at the distance of a
+# wall: 0.1 to 1.2 cm at constant drift or with true poses, 6 cm hand-held (validation tunnels).
+_AGREE_M, _WALL_M = 0.015, 3.0
+# There is a jump before a scan that moves by more when it is registered with the scans before it. The most of a session
+# is 1 to 6 cm at constant drift or with true poses, 9 cm in mist or among movers (the same tunnels).
+_JUMP_M = 0.15
 _ROUNDING = 1e-9  # of an interpolated percentile
 # A scan is bent if so many of its points are off the walls, and so many times as many as of the scans around it.
 _BENT_SHARE, _BENT_FACTOR = 0.05, 3.0
@@ -87,12 +92,14 @@ def make_consistent(
     Raises:
         InputError: A scan cannot be read.
     """
-    poses = source.odom_T_sensor
-    is_bent = np.zeros(len(poses), dtype=np.bool_)
-    if len(poses) == 1:
-        return ConsistentScans(source, poses, is_bent)
-    scans, told = Samples(source), _Told(on_step, len(poses))
-    if not _agree(scans, poses, told):
+    recorded = source.odom_T_sensor
+    is_bent = np.zeros(len(recorded), dtype=np.bool_)
+    if len(recorded) == 1:
+        return ConsistentScans(source, recorded, is_bent)
+    scans, told = Samples(source), _Told(on_step, len(recorded))
+    poses = scans.recorded
+    agree = _agree(scans, poses, told)
+    if not agree:
         poses = _follow(scans, _FOLLOWING, told)
         poses, off_share = _sweep_all(scans, poses, _BY_HALVES, told, by_halves=True)
         is_bent = _find_bent(scans.path_m, off_share)
@@ -100,21 +107,52 @@ def make_consistent(
     loops = find_loops(scans, poses) if has_loops else ()
     if loops:
         poses, _ = _sweep_all(scans, close_loops(scans.path_m, poses, loops), _WITH_ALL, told, loops=loops)
+    elif agree:
+        poses = recorded
     return ConsistentScans(source, poses, is_bent)
 
 
 def _agree(scans: Samples, poses: Float64Array, told: _Told) -> bool:
-    """Return whether a sweep moves nine of ten scans by no more than `_AGREE_M`; it ends as soon as that is certain."""
+    """Return whether a sweep moves nine of ten scans by no more than `_AGREE_M`, and there is no jump.
+
+    The sweep ends as soon as its answer is certain.
+    """
     n, moved_m = len(poses), np.zeros(len(poses))
     below = int(0.9 * (n - 1))  # the 90th percentile lies between this one of the sorted values and the next
     n_near = n_far = 0
-    for own, found, _ in _sweep(scans, poses, _WITH_ALL, told):
-        moved_m[own] = np.linalg.norm((found - poses[own])[:, :3, 3], axis=1)
+    for own, found, _ in _sweep(scans, poses, _WITH_ALL, told, by_halves=True):
+        moved_m[own] = _moved_m(poses[own], found)
         n_near += int(np.count_nonzero(moved_m[own] < _AGREE_M * (1 - _ROUNDING)))
         n_far += int(np.count_nonzero(moved_m[own] > _AGREE_M * (1 + _ROUNDING)))
         if n_near >= below + 2 or n_far >= n - below:
             break
-    return not np.percentile(moved_m, 90) > _AGREE_M
+    return not np.percentile(moved_m, 90) > _AGREE_M and not _has_jump(scans, poses)
+
+
+def _has_jump(scans: Samples, poses: Float64Array) -> bool:
+    """Return whether the last scan of any block moves by more than `_JUMP_M` in the map of the scans before the block.
+
+    A sweep does not see one jump: the scans on either side of it hold one another.
+    """
+    path_m = scans.path_m
+    bounds = np.append(np.flatnonzero(np.diff(np.floor(path_m / _BLOCK_M))) + 1, len(poses))
+    for start, end in pairwise(bounds.tolist()):
+        before = np.arange(np.searchsorted(path_m, path_m[start] - _AROUND_M), start)
+        if not len(before):
+            continue
+        last = poses[end - 1]
+        target = Target(scans, poses, before, last[:3, 3], _FOLLOWING.voxel_m)
+        found, _ = register_scan(scans.of_scan(end - 1), last, [last], target, _FOLLOWING)
+        if _moved_m(last[None], found[None])[0] > _JUMP_M:
+            return True
+    return False
+
+
+def _moved_m(poses: Float64Array, found: Float64Array) -> Float64Array:
+    """Return the (N,) shifts from (N, 4, 4) poses to others, or what turns move at a wall where that is more."""
+    motions = invert(poses) @ found
+    turns_rad = Rotation.from_matrix(motions[:, :3, :3]).magnitude()
+    return np.asarray(np.maximum(np.linalg.norm(motions[:, :3, 3], axis=1), _WALL_M * turns_rad))
 
 
 class _Told:
@@ -134,9 +172,10 @@ class _Told:
 
 def _find_bent(path_m: Float64Array, off_share: Float64Array) -> BoolArray:
     """Return which scans are bent, by (S,) path and (S,) shares of points off the walls."""
-    first, end = (np.searchsorted(path_m, path_m + way_m) for way_m in (-_AROUND_M, _AROUND_M))
-    usual = [np.median(off_share[a:b]) for a, b in zip(first, np.maximum(end, first + 1), strict=True)]
-    return np.asarray(off_share > np.maximum(_BENT_SHARE, _BENT_FACTOR * np.array(usual)))
+    stops_m, stop = np.unique(path_m, return_inverse=True)  # scans of one stop have the same neighbours
+    first, end = (np.searchsorted(path_m, stops_m + way_m) for way_m in (-_AROUND_M, _AROUND_M))
+    usual = np.array([np.median(off_share[a:b]) for a, b in zip(first, np.maximum(end, first + 1), strict=True)])
+    return np.asarray(off_share > np.maximum(_BENT_SHARE, _BENT_FACTOR * usual[stop]))
 
 
 def _follow(scans: Samples, settings: Registration, told: _Told) -> Float64Array:
@@ -193,10 +232,11 @@ def _sweep(
     """
     told.begin()
     steps = invert(scans.recorded[:-1]) @ scans.recorded[1:]
+    ends_m = scans.path_m[[each for loop in loops for each in ((loop.scan, loop.other), (loop.other, loop.scan))]]
     blocks = np.floor(scans.path_m / _BLOCK_M)
     for block in np.unique(blocks):
         own = np.flatnonzero(blocks == block)
-        near = np.flatnonzero(_is_near(scans.path_m, own[0], own[-1], loops))
+        near = np.flatnonzero(_is_near(scans.path_m, own[0], own[-1], ends_m.reshape(-1, 2)))
         centre = poses[own[len(own) // 2], :3, 3]
         halves = [near[near % 2 == 1], near[near % 2 == 0]] if by_halves else [near, near]
         if not all(len(half) for half in halves):
@@ -215,11 +255,17 @@ def _sweep(
         yield own, found, off_share
 
 
-def _is_near(path_m: Float64Array, first: int, last: int, loops: tuple[Loop, ...]) -> BoolArray:
-    """Return which (S,) scans are near to a block of scans along the path, or along another pass of a closed loop."""
+def _is_near(path_m: Float64Array, first: int, last: int, ends_m: Float64Array) -> BoolArray:
+    """Return which (S,) scans are near to a block of scans along the path, or along another pass of a closed loop.
+
+    Args:
+        path_m: (S,) path length at every scan.
+        first: First scan of the block.
+        last: Last scan of the block.
+        ends_m: (L, 2) path length at one end of each loop, and at its other end; each loop both ways.
+    """
     is_near: BoolArray = (path_m >= path_m[first] - _AROUND_M) & (path_m <= path_m[last] + _AROUND_M)
-    for loop in loops:
-        for here, there in ((loop.scan, loop.other), (loop.other, loop.scan)):
-            if path_m[first] - _BLOCK_M <= path_m[here] <= path_m[last] + _BLOCK_M:
-                is_near |= np.abs(path_m - path_m[there]) <= _AROUND_M
+    here_m, there_m = ends_m.T
+    for there in there_m[(here_m >= path_m[first] - _BLOCK_M) & (here_m <= path_m[last] + _BLOCK_M)]:
+        is_near |= np.abs(path_m - there) <= _AROUND_M
     return is_near

@@ -17,6 +17,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import Float64Array, Int64Array, invert, make_pose, transform
+from cdpipe.core.geometry.path_frames import path_frames
 from cdpipe.mapping.poses.scan_registration import MIN_PAIRS, Registration, Samples, Target, register_scan, spread
 
 # Places are this far apart along the path; those closer than the second are no two passes.
@@ -70,12 +71,20 @@ def find_loops(scans: Samples, poses: Float64Array) -> tuple[Loop, ...]:
         scans: The scans.
         poses: (S, 4, 4) poses that agree along the path, odom frame.
     """
-    found = []
-    for scan, other in _find_candidates(scans.path_m, poses):
-        other_T_scan = _register_places(scans, poses, scan, other)
+    candidates, found = _find_candidates(scans.path_m, poses), []
+    odom_T_path = path_frames(poses, np.array([other for _, other in candidates], dtype=np.int64))
+    for (scan, other), ahead in zip(candidates, odom_T_path[:, :3, 0], strict=True):
+        other_T_scan = _register_places(scans, poses, scan, other, ahead)
         if other_T_scan is not None:
             found.append(Loop(scan, other, other_T_scan))
-    return tuple(loop for loop in found if _is_confirmed(loop, found, scans.path_m, poses))
+    at_m = scans.path_m[[loop.scan for loop in found]]  # in order, so neighbours are neighbours in the list
+    first = np.searchsorted(at_m, at_m - _NEIGHBOUR_M, side="left")
+    end = np.searchsorted(at_m, at_m + _NEIGHBOUR_M, side="right")
+    return tuple(
+        loop
+        for loop, a, b in zip(found, first, end, strict=True)
+        if _is_confirmed(loop, found[a:b], scans.path_m, poses)
+    )
 
 
 def close_loops(path_m: Float64Array, poses: Float64Array, loops: tuple[Loop, ...]) -> Float64Array:
@@ -133,11 +142,13 @@ class _Place:
 
     def __init__(self, scans: Samples, poses: Float64Array, scan: int) -> None:
         way_m = np.abs(scans.path_m - scans.path_m[scan])
-        scan_T_others = invert(poses[scan]) @ poses
+        near = np.flatnonzero(way_m <= _TARGET_M)
+        scan_T_others = np.empty_like(poses)  # those of near scans are used
+        scan_T_others[near] = invert(poses[scan]) @ poses[near]
         around = spread(np.flatnonzero(way_m <= _AROUND_M))
         points = np.concatenate([transform(scan_T_others[k], scans.of_scan(k)) for k in around.tolist()])
         self.points = points[np.einsum("ij,ij->i", points, points) < (2 * _AROUND_M) ** 2]
-        self.target = Target(scans, scan_T_others, np.flatnonzero(way_m <= _TARGET_M), np.zeros(3), _FINE.voxel_m)
+        self.target = Target(scans, scan_T_others, near, np.zeros(3), _FINE.voxel_m)
 
     def align(
         self, other: _Place, start: Float64Array, registrations: Sequence[Registration]
@@ -152,12 +163,16 @@ class _Place:
         return pose, float(np.mean(np.abs(distances_m) <= _INLIER_M))
 
 
-def _register_places(scans: Samples, poses: Float64Array, scan: int, other: int) -> Float64Array | None:
-    """Return the (4, 4) other_T_scan of two places, None where a gate refuses it."""
+def _register_places(
+    scans: Samples, poses: Float64Array, scan: int, other: int, ahead: Float64Array
+) -> Float64Array | None:
+    """Return the (4, 4) other_T_scan of two places, None where a gate refuses it.
+
+    Other starts lie along (3,) `ahead`, the unit direction of the path at the other place, odom frame.
+    """
     here, there = _Place(scans, poses, scan), _Place(scans, poses, other)
     start = invert(poses[other]) @ poses[scan]
-    ahead = poses[min(other + 1, len(poses) - 1), :3, 3] - poses[max(other - 1, 0), :3, 3]
-    ahead_other = poses[other, :3, :3].T @ ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+    ahead_other = poses[other, :3, :3].T @ ahead
     starts = [make_pose(translation=shift_m * ahead_other) @ start for shift_m in _STARTS_M]
     found = [here.align(there, each, _REGISTRATIONS) for each in starts]
     best_pose, best = max(found, key=lambda each: each[1])
@@ -171,9 +186,9 @@ def _register_places(scans: Samples, poses: Float64Array, scan: int, other: int)
     return best_pose if agree else None
 
 
-def _is_confirmed(loop: Loop, found: list[Loop], path_m: Float64Array, poses: Float64Array) -> bool:
+def _is_confirmed(loop: Loop, nearby: list[Loop], path_m: Float64Array, poses: Float64Array) -> bool:
     """Return whether a neighbouring loop of the same passes says the same, up to the odometry between them."""
-    for each in found:
+    for each in nearby:
         way_m = max(abs(path_m[each.scan] - path_m[loop.scan]), abs(path_m[each.other] - path_m[loop.other]))
         if each is loop or way_m > _NEIGHBOUR_M:
             continue

@@ -28,6 +28,7 @@ _STEPS, _CONVERGED = 4, 2e-4
 # to 0.011; rough drifts 0.012 to 0.33). Nothing counts up to this share, and all from twice as much.
 _NOISE_SHARE = 0.006
 MIN_PAIRS = 50
+_ROUNDING = 1e-12  # of a rotation in float64
 # A point at this distance from the planes of a map is not on its walls.
 _OFF_WALLS_M = 0.1
 
@@ -52,10 +53,13 @@ class Registration:
 
 
 class Samples:
-    """Points of every scan, in its sensor frame, and the recorded path."""
+    """Points of every scan, in its sensor frame, and the recorded path.
+
+    Rotations that are exact only to float32 are made orthonormal: their inverses are taken, and errors would add up.
+    """
 
     def __init__(self, source: ScanSource) -> None:
-        self.recorded = source.odom_T_sensor
+        self.recorded = _orthonormal(source.odom_T_sensor)
         self.path_m = travelled_m(self.recorded)
         of_map, of_scan = SpooledArray(np.float32, (3,)), SpooledArray(np.float32, (3,))
         sizes = []
@@ -79,6 +83,17 @@ class Samples:
     def _part(self, kind: int, index: int) -> Float64Array:
         start, end = self._offsets[index : index + 2, kind]
         return self._points[kind][start:end].astype(np.float64)
+
+
+def _orthonormal(poses: Float64Array) -> Float64Array:
+    """Return the (S, 4, 4) poses with orthonormal rotations; those that are so to the rounding of float64 stay."""
+    rotations = poses[:, :3, :3]
+    defects = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    if not (is_off := defects > _ROUNDING).any():
+        return poses
+    poses = poses.copy()
+    poses[is_off, :3, :3] = Rotation.from_matrix(rotations[is_off]).as_matrix()
+    return poses
 
 
 def spread(scans: Int64Array) -> Int64Array:

@@ -161,6 +161,13 @@ def test_keyframes_by_hand() -> None:
     assert choose_keyframes(poses[:1], 1.0).tolist() == [0]
 
 
+def test_a_stop_makes_no_keyframes() -> None:
+    # 2 m in steps of 0.5 m, 600 scans of a sensor that jitters by 1 cm (6 m of path), and 2 m more
+    x_m = np.concatenate([np.arange(5) * 0.5, 2 + 0.01 * (np.arange(600) % 2), 2.01 + np.arange(1, 5) * 0.5])
+    poses = make_pose(translation=np.column_stack([x_m, np.zeros((len(x_m), 2))]))
+    assert choose_keyframes(poses, 1.0).tolist() == [0, 2, 4, 605, 607]
+
+
 def test_a_map_of_one_point() -> None:
     class OneScan(RandomScans):
         def scans(self) -> Iterator[PosedScan]:

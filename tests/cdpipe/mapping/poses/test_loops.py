@@ -1,12 +1,15 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
+from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, travelled_m, yaw_pose
+from cdpipe.mapping.poses import loops as loops_module
 from cdpipe.mapping.poses.consistency import make_consistent
-from cdpipe.mapping.poses.loops import Loop, _find_candidates, close_loops, find_loops
+from cdpipe.mapping.poses.loops import Loop, _find_candidates, _is_confirmed, close_loops, find_loops
 from cdpipe.mapping.poses.scan_registration import Samples
 from tests.cdpipe.conftest import CloudScans
 
@@ -122,6 +125,30 @@ def test_the_candidates_of_many_passes_grow_with_the_path() -> None:
         assert {scan - other >= 25 for scan, other in found} == {True}
         counts.append(len(found))
     assert counts[1] < 2.6 * counts[0]
+
+
+def test_a_stop_tells_the_way_ahead_and_a_loop_is_compared_with_its_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
+    # 2 x 500 m along x, 4 m apart; on the first pass the sensor stands for 20 scans every 100 m, and jitters in z
+    there_m = np.repeat(np.arange(0.0, 500.0), np.where(np.arange(500) % 100 == 50, 20, 1))
+    x_m, y_m = np.concatenate([there_m, np.arange(500.0, 0.0, -1.0)]), np.repeat([0.0, 4.0], [len(there_m), 500])
+    z_m = np.concatenate([0.01 * (np.arange(len(there_m)) % 2), np.zeros(500)])
+    poses = make_pose(translation=np.column_stack([x_m, y_m, z_m]))
+    ways, compared = [], []
+
+    def register(_: Samples, poses: Float64Array, scan: int, other: int, ahead: Float64Array) -> Float64Array:
+        ways.append(ahead)
+        return np.asarray(invert(poses[other]) @ poses[scan])
+
+    def is_confirmed(loop: Loop, nearby: list[Loop], path_m: Float64Array, poses: Float64Array) -> bool:
+        compared.append(len(nearby))
+        return _is_confirmed(loop, nearby, path_m, poses)
+
+    monkeypatch.setattr(loops_module, "_register_places", register)
+    monkeypatch.setattr(loops_module, "_is_confirmed", is_confirmed)
+    found = find_loops(SimpleNamespace(path_m=travelled_m(poses)), poses)  # type: ignore[arg-type]
+    assert len(found) == len(ways) > 100
+    np.testing.assert_allclose(np.abs(np.array(ways) @ [1.0, 0.0, 0.0]), 1.0, atol=1e-3)
+    assert min(compared) >= 3 and max(compared) <= 7
 
 
 def test_the_pose_graph_shares_an_error_out_over_the_round() -> None:
