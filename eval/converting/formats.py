@@ -23,8 +23,10 @@ class OutFormat:
         write: Writes a session or a recording to a path that does not exist; of a folder, into an empty one. None
             where only maps of answers or worlds leave so.
         truth: What the truth adds, for the printed line; empty where there is no room for it.
+        truth_of_story: What it adds to a session of a story, which has no truth about changes; empty where that is
+            needed.
         beside: Ending of a second file, put in place of the suffix; written always, or with the truth alone.
-        takes_answers: Whether the map of an answer leaves so.
+        is_map: Whether it is one map: that of an answer leaves so, and one without scans in no other format.
         is_ours_alone: Whether sessions leave so, and other recordings do not.
     """
 
@@ -32,8 +34,9 @@ class OutFormat:
     suffixes: tuple[str, ...] = ()
     write: Callable[[Request, Path], None] | None = None
     truth: str = ""
+    truth_of_story: str = ""
     beside: str = ""
-    takes_answers: bool = False
+    is_map: bool = False
     is_ours_alone: bool = False
 
     @property
@@ -43,25 +46,31 @@ class OutFormat:
 
 
 _FIELDS = "with truth as fields change and instance"
+_INSTANCE = "with truth as field instance"
 _TRUE = "with the true poses beside it"
 FORMATS = {
     "osf": OutFormat(
-        "Ouster OSF", (".osf",), writers.write_osf, "with truth as fields LABEL and INSTANCE", is_ours_alone=True
+        "Ouster OSF",
+        (".osf",),
+        writers.write_osf,
+        "with truth as fields LABEL and INSTANCE",
+        "with truth as field INSTANCE",
+        is_ours_alone=True,
     ),
     "pcap": OutFormat(
         "Ouster PCAP with its metadata .json", (".pcap",), writers.write_pcap, beside=".json", is_ours_alone=True
     ),
-    "mcap": OutFormat("MCAP of ROS 2 messages", (".mcap",), writers.write_mcap, _FIELDS),
-    "ros1": OutFormat("ROS 1 bag", (".bag",), writers.write_ros1, _FIELDS),
-    "ros2": OutFormat("folder of a ROS 2 bag (sqlite3)", (), writers.write_ros2, _FIELDS),
+    "mcap": OutFormat("MCAP of ROS 2 messages", (".mcap",), writers.write_mcap, _FIELDS, _INSTANCE),
+    "ros1": OutFormat("ROS 1 bag", (".bag",), writers.write_ros1, _FIELDS, _INSTANCE),
+    "ros2": OutFormat("folder of a ROS 2 bag (sqlite3)", (), writers.write_ros2, _FIELDS, _INSTANCE),
     "pcd": OutFormat(
         "folder of PCD files", (), writers.write_pcds, f"and what moves is 1 in {writers.GT_CLOUD}", is_ours_alone=True
     ),
     "semantic-kitti": OutFormat("folder as of SemanticKITTI", (), writers.write_semantic_kitti, "with truth as labels"),
-    "tum": OutFormat("TUM poses", (".tum",), writers.write_tum, _TRUE, ".true.tum"),
-    "kitti-poses": OutFormat("KITTI poses", (".kitti",), writers.write_kitti_poses, _TRUE, ".true.kitti"),
-    "laz": OutFormat("LAZ or LAS map", (".laz", ".las"), writers.write_laz, _FIELDS, takes_answers=True),
-    "ply": OutFormat("PLY map", (".ply",), writers.write_ply, _FIELDS, takes_answers=True),
+    "tum": OutFormat("TUM poses", (".tum",), writers.write_tum, _TRUE, _TRUE, ".true.tum"),
+    "kitti-poses": OutFormat("KITTI poses", (".kitti",), writers.write_kitti_poses, _TRUE, _TRUE, ".true.kitti"),
+    "laz": OutFormat("LAZ or LAS map", (".laz", ".las"), writers.write_laz, _FIELDS, _INSTANCE, is_map=True),
+    "ply": OutFormat("PLY map", (".ply",), writers.write_ply, _FIELDS, _INSTANCE, is_map=True),
     "rrd": OutFormat("recording for Rerun", (".rrd",), writers.write_rrd, "with what changed in red"),
     "glb": OutFormat("GLB of a world", (".glb",)),
 }

@@ -14,6 +14,7 @@ from cdpipe.io.out.kitti import LABEL, Label
 from cdpipe.io.out.scans import Fields
 from cdpipe.io.session import Session
 from sim.session.truth import MIXED, read_chunk_labels, read_chunk_surface, read_pair_truth
+from sim.story.state import is_story
 
 _KINDS = ("added", "removed", "moved", "reshaped")
 _UNLABELED, _OUTLIER, _ROCK, _PROP, _MOVING, _FIRST_CHANGE = 0, 1, 52, 99, 259, 300
@@ -29,18 +30,27 @@ LABELS = (
 )  # fmt: skip
 
 
+def knows_changes(session: Session) -> bool:
+    """Return whether the truth of a session tells what changed: of a story's session there is none of changes."""
+    return not is_story(session.path.resolve().parent)
+
+
 def truth_fields(session: Session) -> Fields:
     """Return what gives `change`, `instance`, and where rock moves `displacement` of returns, as `sim.session.truth`.
+
+    A session of a story has no `change`.
 
     Raises:
         InputError: When called: the truth of a chunk is missing or damaged.
     """
+    has_changes = knows_changes(session)
 
     @lru_cache(maxsize=1)
     def of_chunk(index: int) -> dict[str, npt.NDArray[Any]]:
         instance, change = read_chunk_labels(session.path, index)
         surface = read_chunk_surface(session.path, index)
-        return {"change": change, "instance": instance} | ({} if surface is None else {"displacement": surface[0]})
+        found = {"change": change, "instance": instance} if has_changes else {"instance": instance}
+        return found | ({} if surface is None else {"displacement": surface[0]})
 
     def of_scan(scan: int, pixels: Int32Array) -> Mapping[str, npt.NDArray[Any]]:
         chunk, row = divmod(scan, session.chunk_scans)

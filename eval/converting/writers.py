@@ -9,15 +9,22 @@ from pathlib import Path
 
 import numpy as np
 
+from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import transform
+from cdpipe.core.geometry.voxel import FINEST_CELL_M, max_coordinate_m
 from cdpipe.io.out.scans import Outgoing
 from eval.converting.request import Request
+from eval.converting.truth import knows_changes
 
 GT_CLOUD = "gt_cloud.pcd"
+_FARTHEST_M = max_coordinate_m(FINEST_CELL_M)  # maps and `detect` end here; 32-bit numbers are off by 2 mm
 
 
 def write_osf(request: Request, path: Path) -> None:
-    """Write OSF. LABEL is the change's id, 0 none, 65535 (-1) mixed returns; INSTANCE as `sim.session.truth`."""
+    """Write OSF. LABEL is the change's id, 0 none, 65535 (-1) mixed returns; INSTANCE as `sim.session.truth`.
+
+    A session of a story has no LABEL.
+    """
     from cdpipe.io.ouster.osf import write_osf as write
     from sim.session.truth import read_labels
 
@@ -26,7 +33,11 @@ def write_osf(request: Request, path: Path) -> None:
         told = {name: value for name, value in session.provenance.items() if name != "sensor_profile"}
         session = replace(session, provenance=told)
     labels = read_labels(session.path, session.n_chunks)
-    fields = ({"LABEL": of.astype(np.uint16), "INSTANCE": instance.astype(np.int16)} for instance, of in labels)
+    has_changes = knows_changes(session)
+    fields = (
+        ({"LABEL": change.astype(np.uint16)} if has_changes else {}) | {"INSTANCE": instance.astype(np.int16)}
+        for instance, change in labels
+    )
     write(session, path, fields if request.with_truth else None, request.progress.stage)
 
 
@@ -75,6 +86,7 @@ def write_pcds(request: Request, folder: Path) -> None:
     from sim.session.truth import read_pair_truth
 
     session = request.own_session()
+    _require_float32(request)
     truth = read_pair_truth(session.path.parent) if request.with_truth else None
     counts = chain.from_iterable(chunk.reflectivity for chunk in session.chunks())
     (folder / "pcd").mkdir()
@@ -87,6 +99,17 @@ def write_pcds(request: Request, folder: Path) -> None:
         points = build_scoring_points(session)
         movers = [mover.instance for mover in truth.movers]
         write_pcd(folder / GT_CLOUD, points.points_odom.astype(np.float64), np.isin(points.instance, movers))
+
+
+def _require_float32(request: Request) -> None:
+    """Raise `InputError` if the path lies so far out that 32-bit numbers are off by millimetres."""
+    farthest_m = float(np.abs(request.source.odom_T_sensor[:, :3, 3]).max())
+    if farthest_m > _FARTHEST_M:
+        off_m = float(np.spacing(np.float32(farthest_m))) / 2
+        raise InputError(
+            f"{request.source.name}: positions reach {farthest_m:.0f} m, where the 32-bit numbers of PCD are off by up "
+            f"to {off_m:.2g} m: convert the recording to a session again, with --origin X,Y,Z"
+        )
 
 
 def write_semantic_kitti(request: Request, folder: Path) -> None:

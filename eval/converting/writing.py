@@ -11,6 +11,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.model.types import ScanSource
 from eval.converting.formats import FORMATS, OutFormat
 from eval.converting.request import Request
+from eval.converting.truth import knows_changes
 from eval.converting.writers import require_formats
 from eval.core.output import new_files, new_folder, unwritable
 from eval.core.terminal.progress import RunProgress
@@ -30,11 +31,17 @@ def write_session(request: Request, out: Path, name: str) -> str:
         raise InputError(f"{out}: {form.about} has no room for the truth: leave --with-truth out")
     if request.with_truth and not (request.own_session().path / "truth").is_dir():
         raise InputError(f"{request.source.name}: there is no truth in it: leave --with-truth out")
+    truth = form.truth if request.session is None or knows_changes(request.session) else form.truth_of_story
+    if request.with_truth and not truth:
+        raise InputError(
+            f"{request.source.name}: a session of a story: the truth in a {form.about} is that of a pair: make one, "
+            "`tunnelcd pair STORY 1 2 --out PAIR`, or leave --with-truth out"
+        )
     with _output(out, form, has_second=bool(form.beside) and (request.with_truth or not form.truth)) as partial:
         form.write(request, partial)
     n_scans = len(request.source.odom_T_sensor)
-    what = "revolution" if request.session is not None else "scan"
-    told = form.truth if request.with_truth else "without truth"
+    what = "revolution" if request.session is not None else "scan" if request.outgoing().has_scans else "station"
+    told = truth if request.with_truth else "without truth"
     return f"{out}: {n_scans} {what}{'' if n_scans == 1 else 's'}, {told}, {_size_mb(out):.1f} MB"
 
 
@@ -50,8 +57,8 @@ def write_answer_map(
     from cdpipe.io.out.clouds import write_laz, write_ply
 
     form = FORMATS[name]
-    if not form.takes_answers:
-        maps = ", ".join(suffix for each in FORMATS.values() if each.takes_answers for suffix in each.suffixes)
+    if not form.is_map:
+        maps = ", ".join(suffix for each in FORMATS.values() if each.is_map for suffix in each.suffixes)
         raise InputError(f"{out}: an answer becomes a map with scalar fields: name a new file that ends in {maps}")
     if name == "laz":
         require_formats(out)
@@ -98,6 +105,8 @@ def _output(out: Path, form: OutFormat, *, has_second: bool = False) -> Iterator
         InputError: The output exists already or cannot be written, or the block raises it; the text names the output.
     """
     paths = [out, out.with_suffix(form.beside)] if has_second else [out]
+    if len(set(paths)) < len(paths):
+        raise InputError(f"{out}: the name of the file that is written beside it, {form.beside}: name it otherwise")
     with new_folder(out) if form.is_folder else new_files(*paths) as folder:
         partial = folder if form.is_folder else folder / out.name
         try:

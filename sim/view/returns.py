@@ -19,6 +19,7 @@ from sim.session.truth import read_chunk_labels, read_labels
 
 Rgb = tuple[int, int, int]
 MAX_POINTS = 300_000
+_FAR_M = 10_000.0
 _ROCK_RGB = (150, 150, 150)
 _AIR_RGB = (140, 200, 240)  # returns of mist and dust, of what water and glass mirror, and of glare
 _NOT_THERE = (AIR, MIRRORED, GLARE)
@@ -96,6 +97,20 @@ def session_cloud(
         "height": by_height,
     }
     return Cloud(name, cloud, colours)
+
+
+def move_near(poses: Float64Array) -> tuple[Float64Array, Float64Array, tuple[str, ...]]:
+    """Return poses (S, 4, 4) less a place, that place (3,), and a note about it.
+
+    The place is the middle of the path, rounded to kilometres, where it lies beyond 10 km: there the steps of the
+    float32 numbers of a view are 1 mm, in the coordinates of a map grid half a metre. Nearer it is 0, without a note.
+    """
+    place = np.round(poses[len(poses) // 2, :3, 3], -3)
+    if np.abs(place).max() <= _FAR_M:
+        return poses, np.zeros(3), ()
+    near = poses.copy()
+    near[:, :3, 3] -= place
+    return near, place, (f"shown about {', '.join(f'{metres + 0.0:.0f}' for metres in place)} m",)
 
 
 def points_cloud(name: str, points: Float64Array) -> Cloud:

@@ -28,7 +28,7 @@ from sim.session.truth import SESSIONS, PairTruth, SessionName, read_pair_truth,
 from sim.story.state import is_story
 from sim.view.building import PlacedMover, build_pair, list_pools, place_movers, plan_drives
 from sim.view.picture import material_colour
-from sim.view.returns import CHANGE_RGB, SESSION_RGB, Cloud, Revolutions, Rgb, points_cloud, session_cloud
+from sim.view.returns import CHANGE_RGB, SESSION_RGB, Cloud, Revolutions, Rgb, move_near, points_cloud, session_cloud
 from sim.view.rock import ROCK_RGB, class_name, displacement_classes, outline_rgb
 
 _N_BANDS = 10
@@ -159,28 +159,29 @@ def view_pair(pair: Path) -> View:
 
 
 def view_session(folder: Path) -> View:
-    """Return the path of a session and a sample of its returns, both in its odom frame.
+    """Return the path of a session and a sample of its returns, in its odom frame, or near it (`move_near`).
 
     Raises:
         InputError: The session is missing or damaged.
     """
     session = read_session(folder)
-    poses = session.odom_T_sensor
+    poses, _, notes = move_near(session.odom_T_sensor)
     cloud = session_cloud("returns/session", session, poses, None)
     middle = poses[len(poses) // 2, :3, 3]
     line = Line("paths/session", poses[:, :3, 3], SESSION_RGB["after"])
     eye = middle + np.array([-8.0, -8.0, 10.0])
     play = _player([("session", poses)], (), {}, [Revolutions("revolution/session", session, poses, None)])
-    return View(str(folder), (), (), (line,), (cloud,), (), eye, middle, play=play)
+    return View(str(folder), (), (), (line,), (cloud,), (), eye, middle, notes, play)
 
 
 def view_points(title: str, points: Float64Array, poses: Float64Array) -> View:
-    """Return the path (S, 4, 4) and a sample of the returns (N, 3) of a recording, both in its odom frame, metres."""
-    cloud = points_cloud("returns/session", points)
+    """Return the path (S, 4, 4) and a sample of the returns (N, 3) of a recording, as `view_session`, metres."""
+    poses, place, notes = move_near(poses)
+    cloud = points_cloud("returns/session", points - place)
     middle = poses[len(poses) // 2, :3, 3]
     line = Line("paths/session", poses[:, :3, 3], SESSION_RGB["after"])
     play = _player([("session", poses)], (), {}, [])
-    return View(title, (), (), (line,), (cloud,), (), middle + np.array([-8.0, -8.0, 10.0]), middle, play=play)
+    return View(title, (), (), (line,), (cloud,), (), middle + np.array([-8.0, -8.0, 10.0]), middle, notes, play)
 
 
 def _player(

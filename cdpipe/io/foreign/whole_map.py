@@ -55,7 +55,8 @@ class MapStations:
             InputError: The map has no point, or no floor with room for a sensor, or is too large.
         """
         self.name = str(path)
-        points = cloud.points[np.isfinite(cloud.points).all(axis=1)]
+        is_finite = np.isfinite(cloud.points).all(axis=1)
+        points = cloud.points[is_finite]
         try:
             stations = find_stations(points)
         except ValueError as error:
@@ -71,6 +72,7 @@ class MapStations:
         self._stations = stations[used]
         order = np.argsort(station, kind="stable")
         self._points = points[order]
+        self._intensity = None if cloud.intensity is None else cloud.intensity[is_finite][order]
         self._ends = np.cumsum([0, *np.bincount(station)])
         poses = np.tile(np.eye(4), (len(used), 1, 1))
         poses[:, :3, 3] = self._stations
@@ -85,8 +87,10 @@ class MapStations:
         return f"{self.name}: station {index}"
 
     def read(self, index: int) -> Cloud:
-        """Return the points of a station, in its frame."""
-        return Cloud(self._points[slice(*self._ends[index : index + 2])] - self._stations[index])
+        """Return the points of a station, in its frame, with their intensities where the map has some."""
+        own = slice(*self._ends[index : index + 2])
+        shone = None if self._intensity is None else self._intensity[own]
+        return Cloud(self._points[own] - self._stations[index], intensity=shone)
 
     def read_all(self) -> Iterator[Cloud]:
         """Return the points of all stations in order."""

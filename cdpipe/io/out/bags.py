@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from cdpipe.core.errors import InputError
 from cdpipe.core.plugins import require_extra
 from cdpipe.core.progress import Progress
 from cdpipe.io.out.ros import CLOCK, CLOUD, TRANSFORMS, RosMessages
@@ -26,6 +27,7 @@ from cdpipe.io.out.scans import Outgoing
 
 TOPICS = {"/points": CLOUD, "/tf": TRANSFORMS, "/clock": CLOCK}
 _Write = Callable[[str, int, bytes], None]
+_MOST_S = 2**31 - 1  # int32 seconds of builtin_interfaces/Time, as which rosbags writes the time of ROS 1, too
 _VERSION = 8  # of the metadata of a ROS 2 bag; newer versions of rosbags ask for it
 
 
@@ -39,10 +41,11 @@ def write_bag(path: Path, outgoing: Outgoing, kind: str, report: Progress) -> No
         report: Called with the stage, the number of finished scans and their total.
 
     Raises:
-        InputError: The extra `formats` is not installed, or a scan cannot be read.
+        InputError: The extra `formats` is not installed, ROS cannot hold the times, or a scan cannot be read.
         OSError: The file cannot be written.
     """
     require_extra("formats", str(path))
+    _require_times(outgoing)
     messages = RosMessages(is_first=kind == "ros1")
     opened = _open_mcap(path, messages) if kind == "mcap" else _open_bag(path, messages)
     with opened as write:
@@ -52,6 +55,15 @@ def write_bag(path: Path, outgoing: Outgoing, kind: str, report: Progress) -> No
                 write("/tf", stamp_ns, messages.serialize(TRANSFORMS, messages.transform(stamp_ns, pose)))
             # a driver sends a revolution when it is complete
             write("/points", int(scan.path_ns[-1]), messages.serialize(CLOUD, messages.cloud(scan)))
+
+
+def _require_times(outgoing: Outgoing) -> None:
+    first_s, last_s = outgoing.span_s()
+    if not 0 <= first_s <= last_s < _MOST_S + 1:
+        raise InputError(
+            f"{outgoing.name}: its times are {first_s:.10g} to {last_s:.10g} s, ROS holds 0 to {_MOST_S} s: give its "
+            "scans and poses seconds of Unix time, or since its start"
+        )
 
 
 @contextmanager

@@ -25,7 +25,7 @@ def write_laz(path: Path, cloud: PointMap) -> None:
     """Write a map as LAS 1.4, compressed where the name ends in .laz, coordinates rounded to 0.1 mm.
 
     `intensity` and `time` become fields of the format (uint16 and `gps_time`), all others extra dimensions. Intensities
-    of 0 to 1 are scaled to the 16 bits, others rounded.
+    of 0 to 1 are scaled to the 16 bits, others rounded, each `session` by itself; NaN becomes 0.
 
     Raises:
         InputError: The extra `formats` is not installed.
@@ -43,16 +43,20 @@ def write_laz(path: Path, cloud: PointMap) -> None:
     data = laspy.LasData(header)
     data.x, data.y, data.z = cloud.points.T
     for name, values in cloud.scalars.items():
-        data[_STANDARD.get(name, name[:_MOST_NAME])] = _as_16_bits(values) if name == "intensity" else values
+        data[_STANDARD.get(name, name[:_MOST_NAME])] = _as_16_bits(cloud) if name == "intensity" else values
     with path.open("wb") as file:
         data.write(file, do_compress=path.suffix.lower() == ".laz")
 
 
-def _as_16_bits(intensities: np.ndarray[Any, Any]) -> np.ndarray[Any, np.dtype[np.uint16]]:
-    values = np.nan_to_num(intensities.astype(np.float64))
-    is_share = bool(len(values)) and values.max() <= 1.0 and bool((values != np.round(values)).any())
-    whole = np.round(values * (_LARGEST if is_share else 1.0))
-    return np.asarray(np.clip(whole, 0, _LARGEST), np.uint16)
+def _as_16_bits(cloud: PointMap) -> np.ndarray[Any, np.dtype[np.uint16]]:
+    """Return the intensities; two sessions of one map may store them in different units."""
+    values = np.nan_to_num(cloud.scalars["intensity"].astype(np.float64))
+    sessions = cloud.scalars.get("session", np.zeros(len(values), np.int32))
+    for session in np.unique(sessions):
+        own = values[sessions == session]
+        if own.max() <= 1.0 and (own != np.round(own)).any():
+            values[sessions == session] = own * _LARGEST
+    return np.asarray(np.clip(np.round(values), 0, _LARGEST), np.uint16)
 
 
 def write_ply(path: Path, cloud: PointMap) -> None:

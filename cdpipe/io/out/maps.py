@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,23 +27,33 @@ class PointMap:
 def gather_map(outgoing: Outgoing, cell_m: float, report: Progress) -> PointMap:
     """Return the first return of each cell, and of each `change` in it, in the odom frame.
 
-    The values are the scalars of the scans, `time` (seconds of the recording's clock) and `scan`.
+    The values are the scalars of the scans, NaN in scans without, `time` (seconds of the recording's clock) and `scan`;
+    the last two not for a whole map, which has no scans.
 
     Raises:
         InputError: A scan cannot be read, or lies too far away.
     """
     cells: defaultdict[int, UniqueCells] = defaultdict(UniqueCells)
     points: list[Float64Array] = []
-    scalars: defaultdict[str, list[npt.NDArray[Any]]] = defaultdict(list)
+    scalars: list[dict[str, npt.NDArray[Any]]] = []
     for scan in outgoing.scans(report):
         points_odom = transform(scan.odom_T_sensor, scan.points)
         farthest_m = float(np.abs(points_odom).max(initial=0.0))
         require_reachable(f"{outgoing.name}: scan {scan.index}", farthest_m, cell_m)
         is_first = _find_first(scan, points_odom, cells, cell_m)
         points.append(points_odom[is_first])
-        for name, values in _values(scan).items():
-            scalars[name].append(values[is_first])
-    return PointMap(np.concatenate(points), {name: np.concatenate(parts) for name, parts in scalars.items()})
+        found = scan.scalars | (_recorded(scan) if outgoing.has_scans else {})
+        scalars.append({name: values[is_first] for name, values in found.items()})
+    return PointMap(np.concatenate(points), _join(scalars, [len(part) for part in points]))
+
+
+def _join(scalars: Sequence[Mapping[str, npt.NDArray[Any]]], lengths: Sequence[int]) -> dict[str, npt.NDArray[Any]]:
+    """Return the values of all scans by name, NaN for the points of scans without."""
+    parts = list(zip(scalars, lengths, strict=True))
+    names = dict.fromkeys(name for found in scalars for name in found)
+    return {
+        name: np.concatenate([found.get(name, np.full(n, np.nan, np.float32)) for found, n in parts]) for name in names
+    }
 
 
 def _find_first(scan: OutScan, points: Float64Array, cells: dict[int, UniqueCells], cell_m: float) -> BoolArray:
@@ -56,7 +67,8 @@ def _find_first(scan: OutScan, points: Float64Array, cells: dict[int, UniqueCell
     return is_first
 
 
-def _values(scan: OutScan) -> dict[str, npt.NDArray[Any]]:
+def _recorded(scan: OutScan) -> dict[str, npt.NDArray[Any]]:
+    """Return when each return was recorded, and in which scan."""
     n = len(scan.points)
     time_ns = np.full(n, scan.stamp_ns) if scan.offset_ns is None else scan.stamp_ns + scan.offset_ns
-    return scan.scalars | {"time": time_ns / 1e9, "scan": np.full(n, scan.index, np.int32)}
+    return {"time": time_ns / 1e9, "scan": np.full(n, scan.index, np.int32)}

@@ -52,7 +52,14 @@ class OutScan:
 
 
 class Outgoing:
-    """A session or recording that is to be written in another format."""
+    """A session or recording that is to be written in another format.
+
+    Attributes:
+        name: The source.
+        odom_T_sensor: (S, 4, 4) pose of each scan.
+        session: Its session folder; None of other recordings.
+        has_scans: Whether somebody recorded the scans; those of a whole map are of stations, whose times mean nothing.
+    """
 
     def __init__(self, source: ScanSource, fields: Fields | None = None) -> None:
         """Keep what to write.
@@ -64,6 +71,7 @@ class Outgoing:
         self.name, self.odom_T_sensor = source.name, source.odom_T_sensor
         self._source, self._fields = source, fields
         self.session = source.session if isinstance(source, RecordedScans) else None
+        self.has_scans = not getattr(source, "is_whole_map", False)
 
     def __len__(self) -> int:
         """Return the number of scans."""
@@ -75,6 +83,15 @@ class Outgoing:
         if self.session is not None:
             return int(self.session.provenance.get("sensor_clock_start_ns", START_NS))
         return round(float(self._posed_clouds().stamps_s[0]) * 1e9)
+
+    def span_s(self) -> tuple[float, float]:
+        """Return the first and the last time at which a column of a session, or a scan, was taken."""
+        if self.session is None:
+            stamps_s = self._posed_clouds().stamps_s
+            return float(stamps_s.min()), float(stamps_s.max())
+        first_ns = int(self.session.chunk(0).column_stamps_ns.min()) + self.start_ns
+        last_ns = int(self.session.chunk(self.session.n_chunks - 1).column_stamps_ns.max()) + self.start_ns
+        return first_ns / 1e9, last_ns / 1e9
 
     def stamps_ns(self) -> Int64Array:
         """Return the time (S,) of the pose of each scan."""

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from cdpipe.io.foreign import HowToRead
 
 _FEW_SCANS = 10
+_ORIGIN = "it is subtracted where a recording becomes a session: convert that again"
 _ANSWER = 3  # inputs of an answer's map: before, after, answer
 
 
@@ -96,6 +97,7 @@ def convert(
         (name,) = guess_formats([source], hows)
         _refuse_truth(source, with_truth)
         if out.suffix or to is not None:
+            _refuse_whole_map(source, name, out, to)
             say(quiet, _export(source, out, to, hows[0], progress, cell_m, with_truth=False))
         else:
             say(quiet, _import(source, out, name, hows[0], progress))
@@ -106,6 +108,16 @@ def _refuse_truth(source: Path, with_truth: bool) -> None:
 
     if with_truth:
         raise InputError(f"{source}: a recording has no truth: leave --with-truth out")
+
+
+def _refuse_whole_map(source: Path, name: str, out: Path, to: str | None) -> None:
+    """Raise `InputError` if a single file of a format that holds scans one a file is to become more than a map."""
+    from cdpipe.core.errors import InputError
+    from cdpipe.io.foreign.sniff import FORMATS as RECORDINGS
+    from eval.converting.formats import FORMATS, choose_format
+
+    if RECORDINGS[name].in_folders and not source.is_dir() and not FORMATS[choose_format(out, to)].is_map:
+        raise InputError(f"{source}: a map without its scans has no poses or times: name a new .laz or .ply")
 
 
 def _refuse_world(source: Path, seed: int | None, settings: Sequence[str]) -> None:
@@ -142,7 +154,7 @@ def _is_session(source: Path, how: HowToRead) -> bool:
         given: dict[str, object] = {"metadata": how.metadata, "trajectory": how.trajectory, "odometry": how.odometry}
         given |= {"format": how.format, "topic": how.topics or None, "no-deskew": None if how.deskew else True}
         name = next((name for name, value in given.items() if value is not None), "origin")
-        meant = " (the format that is written is --to)" if name == "format" else ""
+        meant = {"format": " (the format that is written is --to)", "origin": f": {_ORIGIN}"}.get(name, "")
         raise InputError(f"{source}: a session has its own poses and sensor: leave --{name} out{meant}")
     return is_session(source)
 

@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from eval.report.answer.content import AnswerContent
     from sim.view.view import View
 
+_PAGE = b"<html"  # near the start of the pages of viser and of answers
+
 
 def view(
     what: Annotated[
@@ -74,9 +76,12 @@ def view(
 ) -> None:
     """Show a world, a pair, a session, a recording, or what an answer found between two of them, in the browser."""
     from cdpipe.core.errors import InputError
+    from eval.core.output import require_replaceable
 
     if html is not None and not html.absolute().parent.is_dir():
         raise InputError(f"--html {html}: there is no folder {html.parent}: make it, or name another one")
+    if html is not None:
+        require_replaceable(html, _PAGE, "HTML page")
     asked = join_world_settings(world, settings)
     hows = how_to_read(
         1 if after is None else 2, form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin
@@ -123,7 +128,9 @@ def _view_one(
         return
     from sim.view.viewer import write_html
 
-    write_html(load(), html)
+    shown = load()
+    write_html(shown, html)
+    _tell_notes(shown)
     say(quiet, f"{html}: {what}, {html.stat().st_size / 1e6:.1f} MB, opens in any browser")
 
 
@@ -192,14 +199,18 @@ def _serve(load: Callable[[], View], what: str, port: int, host: str, quiet: boo
     with running_server(port, host) as server:
         shown = load()
         show(server, shown)
-        for note in shown.notes:
-            echo(note, err=True)
+        _tell_notes(shown)
         say(quiet, f"{what}: http://{host}:{server.get_port()} (Ctrl-C ends)")
         try:
             while True:
                 time.sleep(1.0)
         except KeyboardInterrupt:
             return
+
+
+def _tell_notes(shown: View) -> None:
+    for note in shown.notes:
+        echo(note, err=True)
 
 
 def _load_with_progress(what: str, seed: int | None, settings: Sequence[str], how: HowToRead, *, quiet: bool) -> View:

@@ -139,7 +139,7 @@ def survey(
     import pandas as pd
 
     from cdpipe.core.errors import InputError
-    from eval.core.output import make_writable
+    from eval.core.output import make_writable, require_replaceable
     from eval.plans.seeds import parse_seeds_option
     from sim.studies import survey as surveys
     from sim.studies.survey import markdown as as_markdown
@@ -148,6 +148,7 @@ def survey(
     numbers = parse_seeds_option(seeds)
     if out is not None:
         make_writable(out.absolute().parent)
+        require_replaceable(out, b"family,seed,before_path_m", "table of `tunnelcd survey`")
     with shown_progress(quiet) as progress:
         found = [surveys.survey(family, numbers, workers, progress.cells) for family in families]
     failures = [failure for one in found for failure in one.failures]

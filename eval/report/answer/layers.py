@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.core.geometry.voxel import thin
 from cdpipe.model.report import SurfaceField
 from eval.report.answer.content import AnswerContent, near_stretches
@@ -22,7 +22,7 @@ _LINE_M, OBJECT_POINT_M, _ROCK_POINT_M = 0.05, 0.09, 0.12
 _FILLED = 0.8
 # Cell of the points of objects and of rock; that of rock grows until no more points are left.
 _OBJECT_CELL_M, _ROCK_CELL_M, _LARGER, _MAX_ROCK = 0.03, 0.1, 1.25, 50_000
-_LARGEST = 65_535
+_LARGEST, _MAX_PATH = 65_535, 20_000
 MOVED_ROCK, ELSEWHERE = "rock that moved", "displacement elsewhere"
 
 
@@ -81,6 +81,11 @@ def pack(layers: Sequence[Layer]) -> tuple[dict[str, Any], str]:
     return head, base64.b64encode(numbers.tobytes()).decode("ascii")
 
 
+def spread(n: int, most: int) -> Int64Array:
+    """Return at most `most` of the places 0 to n - 1, evenly spread, the first and the last among them."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
+
+
 def _maps(content: AnswerContent) -> Iterator[Layer]:
     of_each = content.maps, content.cells_m, content.paths, (BEFORE_RGB, AFTER_RGB)
     for name, points, cell_m, path, rgb in zip(("before", "after"), *of_each, strict=True):
@@ -121,9 +126,12 @@ def _regions(content: AnswerContent) -> Iterator[Layer]:
 
 def _paths(content: AnswerContent) -> Iterator[Layer]:
     """Yield both paths, the before one apart where it was not compared."""
-    before, after = content.paths
-    assert content.report.coverage is not None
+    coverage = content.report.coverage
+    assert coverage is not None
+    few, few_after = (spread(len(path), _MAX_PATH) for path in content.paths)
+    before, after = content.paths[0][few], content.paths[1][few_after]
+    is_near = np.logical_and.reduceat(coverage.is_near, few)  # what was not seen stays red
     for wanted, name, rgb in ((True, "path before", BEFORE_RGB), (False, "path before, not seen", WRONG_RGB)):
-        for stretch in near_stretches(content.report.coverage.is_near, wanted=wanted):
+        for stretch in near_stretches(is_near, wanted=wanted):
             yield Layer(name, "line", before[stretch], rgb)
     yield Layer("path after", "line", after, AFTER_RGB)

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from cdpipe.core.geometry import Float64Array
 from eval.core.figures import blank_figure, data_address
 from eval.report.answer.content import AnswerContent
-from eval.report.answer.layers import Layer, list_layers, pack
+from eval.report.answer.layers import Layer, list_layers, pack, spread
 from eval.report.answer.tables import object_place, tabulate_objects, tabulate_regions, tabulate_rock
 from eval.report.drawing.charts import script_json
 from eval.report.maps import style_map_axes
@@ -90,7 +90,7 @@ def _places(content: AnswerContent) -> dict[str, Any]:
     path, coverage = content.paths[0], content.report.coverage
     assert coverage is not None
     way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    chosen = np.unique(np.linspace(0, len(path) - 1, min(len(path), _PLACES)).round().astype(np.int64))
+    chosen = spread(len(path), _PLACES)
     start = int(np.argmin(np.linalg.norm(path[chosen] - _first_place(content), axis=1)))
     return {"path": path[chosen], "chainage": way_m[chosen], "near": coverage.is_near[chosen], "at": start}
 

@@ -12,6 +12,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, stream, transform
 from cdpipe.io.foreign import HowToRead
 from cdpipe.io.foreign.whole_map import find_stations
+from cdpipe.io.out import Outgoing, gather_map
 from cdpipe.io.ply import write_ply_points
 from cdpipe.io.readers import open_session
 
@@ -60,6 +61,21 @@ def test_a_map_is_opened_as_stations_that_hold_every_point(tmp_path: Path) -> No
     read = np.concatenate([scan.points_sensor + scan.odom_T_sensor[:3, 3] for scan in source.scans()])
     assert len(read) == len(points)
     assert np.allclose(np.sort(read[:, 0]), np.sort(points[:, 0]), atol=1e-4)
+
+
+def test_a_map_keeps_its_intensities_and_leaves_without_times(tmp_path: Path) -> None:
+    points = drift(1)
+    points[7] = np.nan  # is left out, and its intensity with it
+    shone = np.round(10 * points[:, 0]).astype(np.float32)
+    write_ply_points(tmp_path / "map.ply", points, {"intensity": shone})
+    source = open_session(tmp_path / "map.ply")
+    for scan in source.scans():
+        assert scan.intensity is not None
+        along_m = scan.points_sensor[:, 0] + scan.odom_T_sensor[0, 3]
+        np.testing.assert_allclose(scan.intensity, 10 * along_m, atol=0.501)
+    cloud = gather_map(Outgoing(source), 0.2, lambda *_: None)
+    assert list(cloud.scalars) == ["intensity"]
+    np.testing.assert_allclose(cloud.scalars["intensity"], 10 * cloud.points[:, 0], atol=0.501)
 
 
 def test_a_map_on_a_regular_grid_repeats_nothing(tmp_path: Path) -> None:

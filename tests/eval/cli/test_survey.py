@@ -51,6 +51,19 @@ def test_failed_seeds_are_told_and_the_exit_code_is_0(
     assert len(file.read_text().splitlines()) == 1 + 6
 
 
+def test_a_file_that_is_no_survey_is_not_replaced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], asked: list[Any]
+) -> None:
+    file = tmp_path / "narrow.yaml"
+    file.write_text("family: narrow\n")
+    code, _, err = run(capsys, "narrow", "--out", str(file))
+    assert (code, asked) == (2, [])
+    assert err == f"error: {file}: exists, and is no table of `tunnelcd survey`: name a new file, or remove it\n"
+    assert file.read_text() == "family: narrow\n"
+    for _ in range(2):  # its own table is
+        assert run(capsys, "narrow", "--quiet", "--out", str(tmp_path / "s.csv"))[0] == 0
+
+
 def test_the_markdown_can_be_pasted(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = run(capsys, "narrow", "--markdown", "--quiet")
     table = [line for line in out.splitlines() if line.startswith("|")]

@@ -27,6 +27,7 @@ from scenarios import load_scenario
 from sim.rock.glb import count_glb
 from sim.session.truth import read_pair_truth, read_true_poses
 from tests.cdpipe.io.foreign_files import drive, write_trajectory
+from tests.cdpipe.io.test_whole_map import drift
 
 Result = tuple[int, str, str]
 Command = Callable[..., Result]
@@ -223,6 +224,13 @@ def test_intensities_of_a_laz_are_whole_and_shares_fill_16_bits(tmp_path: Path) 
         assert laspy.read(tmp_path / "a.laz").intensity.tolist() == expected
 
 
+def test_each_session_of_a_laz_has_the_unit_of_its_intensities(tmp_path: Path) -> None:
+    laspy = pytest.importorskip("laspy", reason="pip install 'tunnelcd[formats]'")
+    values = {"intensity": np.array([0.5, 255.0, 1.0, 7.0], np.float32), "session": np.array([0, 1, 0, 1], np.int32)}
+    write_laz(tmp_path / "a.laz", PointMap(np.zeros((4, 3)), values))
+    assert laspy.read(tmp_path / "a.laz").intensity.tolist() == [32768, 255, 65535, 7]
+
+
 def made_answer(pair: Path, folder: Path) -> ChangeReport:
     """Write an answer whose one object is what the truth calls changed, with the true merge."""
     fields, source = truth_fields(read_session(pair / "after")), open_session(pair / "after")
@@ -345,6 +353,121 @@ def test_a_recording_too_far_away_for_a_map_is_one_line(tmp_path: Path, command:
     (tmp_path / "r" / "trajectory.txt").write_text(text)
     refused(command("convert", tmp_path / "r", tmp_path / "a.ply"), "subtract a common offset from the trajectory")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["r", "t"]
+
+
+def write_recording(folder: Path, start_s: float = 0.0, far_m: float = 0.0) -> Path:
+    """Write three scans, the second one without intensities, with a trajectory from a time and a place on."""
+    made = drive(3, 200, 0.0)
+    folder.mkdir()
+    for index, (points, _) in enumerate(made.clouds):
+        shone = {} if index == 1 else {"intensity": np.full(len(points), index + 5, np.float32)}
+        write_ply_points(folder / f"{index:06d}.ply", points, shone)
+    path = write_trajectory(folder / "trajectory.txt", made.stamps_s)
+    rows = [line.split() for line in path.read_text().splitlines()]
+    first_s = float(rows[0][0])
+    lines = (f"{start_s + float(row[0]) - first_s:.9f} {float(row[1]) + far_m} {' '.join(row[2:])}\n" for row in rows)
+    path.write_text("".join(lines))
+    return folder
+
+
+def test_scans_without_intensities_have_none_in_a_map(tmp_path: Path, command: Command) -> None:
+    laspy = pytest.importorskip("laspy", reason="pip install 'tunnelcd[formats]'")
+    source = write_recording(tmp_path / "r")
+    for name in ("a.ply", "a.laz"):
+        convert(command, source, tmp_path / name, "--cell", "0.01")
+    _, scalars = read_ply(tmp_path / "a.ply", ("intensity", "scan"))
+    expected = np.choose(scalars["scan"].astype(int), [5.0, np.nan, 7.0])
+    np.testing.assert_array_equal(scalars["intensity"], expected)
+    assert np.isnan(expected).any()
+    np.testing.assert_array_equal(laspy.read(tmp_path / "a.laz").intensity, np.nan_to_num(expected))
+
+
+@pytest.mark.parametrize(("start_s", "is_held"), [(-1.0, False), (2_147_483_640.0, True), (2_147_483_648.0, False)])
+def test_a_bag_holds_the_times_that_ros_holds(tmp_path: Path, command: Command, start_s: float, is_held: bool) -> None:
+    pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
+    source = write_recording(tmp_path / "r", start_s)
+    for name, *options in (("a.mcap",), ("a.bag",), ("a", "--to", "ros2")):
+        code, _, err = result = command("convert", source, tmp_path / name, "--quiet", *options)
+        if is_held:
+            assert (code, err) == (0, "")
+            assert len(open_session(tmp_path / name).odom_T_sensor) == 3
+        else:
+            refused(result, "r: its times are ")
+            assert "ROS holds 0 to 2147483647 s" in err
+    assert len(list(tmp_path.iterdir())) == (4 if is_held else 1)
+
+
+def test_a_map_without_scans_leaves_as_a_map_alone(tmp_path: Path, command: Command) -> None:
+    points = drift(1)
+    source = tmp_path / "b.ply"
+    write_ply_points(source, points, {"intensity": np.arange(len(points), dtype=np.float32)})
+    for name, *options in (
+        ("w.mcap",), ("w.bag",), ("w.tum",), ("w.kitti",), ("w.pcap",), ("w.osf",), ("w.rrd",), ("w", "--to", "ros2"),
+        ("w", "--to", "semantic-kitti"), ("w", "--to", "pcd"),
+    ):  # fmt: skip
+        refused(
+            command("convert", source, tmp_path / name, *options),
+            f"{source}: a map without its scans has no poses or times: name a new .laz or .ply",
+        )
+    refused(command("convert", source, tmp_path / "w", "--quiet"), "a map without its scans is no session")
+    assert [path.name for path in tmp_path.iterdir()] == ["b.ply"]
+    said = convert(command, source, tmp_path / "w.ply", "--cell", "0.01")
+    assert " stations, without truth, " in said
+    found, scalars = read_ply(tmp_path / "w.ply", ("intensity", "time", "scan"))
+    assert list(scalars) == ["intensity"]
+    assert len(found) > 0.9 * len(points)
+    np.testing.assert_allclose(found, points[scalars["intensity"].astype(int)], atol=1e-4)
+
+
+def test_a_session_far_out_is_no_pcd(
+    pair: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pypcd4", reason="pip install 'tunnelcd[formats]'")
+    shutil.copytree(pair / "before", tmp_path / "s")
+    poses = read_session(pair / "before").odom_T_sensor.copy()
+    for far_m, is_refused in ((5.2e6, True), (50_000.0, False)):
+        poses[:, 1, 3] += far_m - poses[0, 1, 3]
+        np.savez(tmp_path / "s" / "odometry.npz", allow_pickle=False, odom_T_sensor=poses)
+        result = command("convert", tmp_path / "s", tmp_path / "out")
+        if is_refused:
+            refused(result, "32-bit numbers of PCD are off by up to 0.25 m: convert the recording to a session again")
+            assert not (tmp_path / "out").exists()
+        else:
+            assert result[0] == 0
+    result = command("convert", tmp_path / "s", tmp_path / "a.laz", "--origin", "0,5000000,0")
+    refused(result, "leave --origin out: it is subtracted where a recording becomes a session")
+
+
+def test_a_session_of_a_story_leaves_without_truth_about_changes(pair: Path, tmp_path: Path, command: Command) -> None:
+    story = tmp_path / "story"
+    shutil.copytree(pair / "before", story / "session-01")
+    (story / "story.json").write_text("{}")
+    said = convert(command, story / "session-01", tmp_path / "a.ply", "--with-truth", "--cell", "0.2")
+    assert "with truth as field instance, " in said
+    assert set(read_ply(tmp_path / "a.ply", ("change", "instance"))[1]) == {"instance"}
+    convert(command, story / "session-01", tmp_path / "a.tum", "--with-truth")
+    assert (tmp_path / "a.true.tum").is_file()
+    for name, *options in (("w",), ("w", "--to", "semantic-kitti"), ("w.rrd",)):
+        refused(
+            command("convert", story / "session-01", tmp_path / name, "--with-truth", *options),
+            "is that of a pair: make one, `tunnelcd pair STORY 1 2 --out PAIR`, or leave --with-truth out",
+        )
+    shutil.copytree(pair / "before", tmp_path / "copied")  # a pair's session: its labels are right
+    said = convert(command, tmp_path / "copied", tmp_path / "b.ply", "--with-truth", "--cell", "0.2")
+    assert "with truth as fields change and instance, " in said
+    osf = pytest.importorskip("ouster.sdk.osf", reason="pip install 'tunnelcd[ouster]'")
+    said = convert(command, story / "session-01", tmp_path / "a.osf", "--with-truth")
+    assert "with truth as field INSTANCE, " in said
+    with osf.OsfFrameSetSource(str(tmp_path / "a.osf")) as source:
+        fields = set(next(iter(source))[0].fields)
+    assert "INSTANCE" in fields and "LABEL" not in fields
+
+
+def test_packets_and_their_metadata_have_two_names(pair: Path, tmp_path: Path, command: Command) -> None:
+    pytest.importorskip("ouster.sdk.core", reason="pip install 'tunnelcd[ouster]'")
+    out = tmp_path / "x.json"
+    refused(command("convert", pair / "before", out, "--to", "pcap"), f"{out}: the name of the file that is written")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_full_disk_is_one_line_and_leaves_nothing(pair: Path, tmp_path: Path, command: Command) -> None:

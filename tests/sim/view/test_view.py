@@ -6,6 +6,7 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pytest
 import trimesh
 
 from cdpipe.core.errors import InputError, ScenarioError
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array, transform
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
 from eval.cli.commands.viewing import load_view
@@ -27,8 +28,8 @@ from sim.session.simulate import simulate, simulate_pair
 from sim.session.truth import read_mover_track, read_pair_truth, read_true_poses
 from sim.view import building, viewer
 from sim.view.building import plan_drives
-from sim.view.returns import _AIR_RGB, CHANGE_RGB, session_cloud
-from sim.view.view import View, view_folder, view_pair, view_scenario, view_session, wall_bands
+from sim.view.returns import _AIR_RGB, CHANGE_RGB, points_cloud, session_cloud
+from sim.view.view import View, view_folder, view_pair, view_points, view_scenario, view_session, wall_bands
 from sim.view.viewer import require_viser, running_server, show, write_html
 
 viser = pytest.importorskip("viser", reason="the extra `view` is not installed")
@@ -287,6 +288,29 @@ def test_a_session_is_placed_as_the_pipeline_places_it(pair: Path) -> None:
     assert view.bands == ()
 
 
+def test_what_lies_in_the_coordinates_of_a_map_grid_is_shown_less_a_place(
+    pair: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = read_session(pair / "after")
+    grid = np.array([432_000.0, 5_411_000.0, 0.0])
+    poses = session.odom_T_sensor.copy()
+    poses[:, :3, 3] += grid
+    far = replace(session, odom_T_sensor=poses)
+    usual = view_session(pair / "after")
+    assert usual.notes == ()
+    monkeypatch.setattr("sim.view.view.read_session", lambda _: far)
+    scan = open_session(pair / "after").scan(0)
+    points = transform(poses[0], scan.points_sensor)
+    nearby = points_cloud("returns/session", points - grid)
+    for view, wanted in ((view_session(pair / "after"), usual.clouds[0]), (view_points("r", points, poses), nearby)):
+        assert view.notes == ("shown about 432000, 5411000, 0 m",)
+        np.testing.assert_allclose(view.clouds[0].points, wanted.points, atol=1e-4)
+        np.testing.assert_allclose(view.lines[0].points, usual.lines[0].points, atol=1e-6)
+        np.testing.assert_allclose(view.target, usual.target, atol=1e-6)
+        assert view.play is not None
+        np.testing.assert_allclose(view.play(0.0)[0][0].mesh.vertices.mean(axis=0), poses[0, :3, 3] - grid, atol=1e-3)
+
+
 def test_a_path_that_cannot_be_driven_is_a_note(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
     def barred(*_arguments: Any) -> Any:
         raise ScenarioError("box bars the way")
@@ -416,6 +440,13 @@ def test_the_command_writes_a_page_and_tells_faults_in_one_line(
     assert (code, err) == (0, [])
     assert out.startswith(f"{file}: {pair}, ") and file.stat().st_size > 1_000_000
     assert call(str(pair), "--html", str(file), "--quiet") == (0, "", [])
+    for mine in (pair / "after" / "session.json", tmp_path / "mine.yaml"):
+        mine.touch()
+        content = mine.read_bytes()
+        assert call(str(pair), "--html", str(mine)) == (
+            2, "", [f"error: {mine}: exists, and is no HTML page: name a new file, or remove it"],
+        )  # fmt: skip
+        assert mine.read_bytes() == content
     missing = tmp_path / "none" / "x.html"
     code, out, err = call(str(pair), "--html", str(missing))
     assert (code, out, len(err)) == (2, "", 1)

@@ -149,6 +149,23 @@ def test_a_page_of_as_many_points_as_there_may_be_is_small_and_asks_no_network()
     assert not re.search(r"\b(fetch|XMLHttpRequest|import)\s*\(", page)
 
 
+def test_paths_of_many_scans_are_thinned_and_keep_their_ends_and_what_was_not_seen() -> None:
+    n = 100_000
+    path = np.column_stack([np.linspace(0, LENGTH_M, n), np.zeros((n, 2))])
+    is_near = np.arange(n) != 50_003  # one scan
+    report = replace(EMPTY, coverage=replace(covered(75.0, 0.0), is_near=is_near))
+    layers = list_layers(replace(content(), report=report, paths=(path, path)))
+    groups = ("path before", "path before, not seen", "path after")
+    lines = {group: [layer.points for layer in layers if layer.group == group] for group in groups}
+    assert sum(map(len, lines["path before"])) <= 20_000
+    assert sum(map(len, lines["path after"])) == 20_000
+    for group in ("path before", "path after"):
+        np.testing.assert_array_equal([lines[group][0][0], lines[group][-1][-1]], path[[0, -1]])
+    (red,) = lines["path before, not seen"]
+    assert red[0, 0] <= path[50_003, 0] <= red[-1, 0]
+    assert np.ptp(red[:, 0]) < 3 * LENGTH_M / 20_000
+
+
 def test_hostile_names_stay_text() -> None:
     page = render_answer_page(content(("</script><script>alert(1)</script>", "<img src=x onerror=alert(1)>")))
     assert "<script>alert" not in page and "<img src=x" not in page
