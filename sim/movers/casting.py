@@ -41,6 +41,12 @@ class MovingCaster(RayCaster):
         """
         self.centre_m = fixed.centre_m
         self._fixed, self._n_fixed, self._movers, self._time_s = fixed, n_fixed, movers, time_s
+        if fixed.keeps_hits:  # a device casts a whole revolution faster than its parts
+            self.block_columns = len(time_s)
+
+    def _at(self, columns: slice) -> RayCaster:
+        """Return the caster of some columns."""
+        return MovingCaster(self._fixed, self._n_fixed, self._movers, self._time_s[columns])
 
     def cast_local(
         self, origins: Float32Array, directions: Float32Array

@@ -15,7 +15,7 @@ import numpy as np
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, stream
 from scenarios.schema import Air, Dust
 from sim.geometry.noise import smooth_noise
-from sim.sensor.footprint import PULSE_M, Echo, choose_echo, no_echo
+from sim.sensor.footprint import EVERYWHERE, PULSE_M, Echo, Limits, choose_echo, no_echo, outweighs
 from sim.sensor.optics import received_photons
 from sim.sensor.plumes import Puffs, fill_lattice
 from sim.sensor.rays import Rays
@@ -150,12 +150,18 @@ def _dust_around(
 
 
 def cross_air(
-    echo: Echo, rays: Rays, beam_origin_m: float, air: AirVolume, generator: np.random.Generator
+    echo: Echo,
+    rays: Rays,
+    beam_origin_m: float,
+    air: AirVolume,
+    generator: np.random.Generator,
+    limits: Limits = EVERYWHERE,
 ) -> tuple[Echo, Echo]:
     """Return the stronger and the weaker echo of a revolution through the air: of dimmed surfaces and of the air.
 
-    The light of each metre of air is counted with the noise of its photons (square root transform); the metre with the
-    highest count is the air's echo, somewhere within it. That the strongest metre wins is ours, unverified.
+    The light of each metre of air within the limits is counted with the noise of its photons (square root transform);
+    the metre with the highest count is the air's echo, somewhere within it. That the strongest metre wins is ours,
+    unverified.
 
     Args:
         echo: The surfaces' echo through clear air.
@@ -163,24 +169,28 @@ def cross_air(
         beam_origin_m: Distance of their origins from the spin axis.
         air: The air.
         generator: Draws as many numbers for every pixel, whatever it meets.
+        limits: The ranges at which the receiver listens.
     """
     n_pixels = echo.range_m.size
     reach_m = np.where(echo.geom != -1, echo.range_m - np.float32(beam_origin_m), np.float32(REACH_M)).ravel()
     depth, best, best_m = (np.zeros(n_pixels, np.float32) for _ in range(3))
     within = generator.random(n_pixels, dtype=np.float32)
+    nearest_m, farthest_m = np.float32(limits.least_m - beam_origin_m), np.float32(limits.most_m - beam_origin_m)
     for step in _walk(reach_m, rays, air):
-        half = step.alpha * step.length_m * np.float32(0.5)
-        depth[step.on_way] += half
         if step.start_m < REACH_M:
             noise = generator.standard_normal(n_pixels, dtype=np.float32)[step.on_way]
-            power = np.float32(np.pi) * step.beta * step.length_m * np.exp(-2 * depth[step.on_way])
-            counted = _count(received_photons(power, step.middle_m + np.float32(beam_origin_m)), noise)
+            skipped_m = max(nearest_m - step.start_m, np.float32(0.0))
+            heard_m = np.minimum(step.length_m, farthest_m - step.start_m) - skipped_m
+            middle_m = skipped_m + heard_m * np.float32(0.5)
+            dimmed = np.exp(-2 * (depth[step.on_way] + step.alpha * middle_m))
+            power = np.float32(np.pi) * step.beta * np.maximum(heard_m, np.float32(0.0)) * dimmed
+            counted = _count(received_photons(power, step.start_m + middle_m + np.float32(beam_origin_m)), noise)
             is_better = counted > best[step.on_way]
             better = step.on_way[is_better]
             best[better] = counted[is_better]
-            best_m[better] = step.start_m + within[better] * step.length_m[is_better]
-        depth[step.on_way] += half
-    return _rank(echo, depth, best, best_m + np.float32(beam_origin_m))
+            best_m[better] = step.start_m + skipped_m + within[better] * heard_m[is_better]
+        depth[step.on_way] += step.alpha * step.length_m
+    return _rank(echo, depth, best, best_m + np.float32(beam_origin_m), limits)
 
 
 def dim_echo(echo: Echo, rays: Rays, beam_origin_m: float, air: AirVolume) -> Echo:
@@ -199,7 +209,6 @@ class _Step:
     start_m: np.float32
     on_way: Int64Array
     length_m: Float32Array
-    middle_m: Float32Array
     alpha: Float32Array
     beta: Float32Array
 
@@ -213,8 +222,7 @@ def _walk(reach_m: Float32Array, rays: Rays, air: AirVolume) -> Iterator[_Step]:
         on_way = np.flatnonzero(reach_m > start_m)
         length_m = np.minimum(reach_m[on_way] - start_m, np.float32(PULSE_M))
         middle_m = start_m + length_m * np.float32(0.5)
-        alpha, beta = air.extinction(origins[:, on_way] + ways[:, on_way] * middle_m)
-        yield _Step(start_m, on_way, length_m, middle_m, alpha, beta)
+        yield _Step(start_m, on_way, length_m, *air.extinction(origins[:, on_way] + ways[:, on_way] * middle_m))
 
 
 def _count(photons: Float32Array, noise: Float32Array) -> Float32Array:
@@ -225,7 +233,9 @@ def _count(photons: Float32Array, noise: Float32Array) -> Float32Array:
     )
 
 
-def _rank(echo: Echo, depth: Float32Array, counted: Float32Array, air_m: Float32Array) -> tuple[Echo, Echo]:
+def _rank(
+    echo: Echo, depth: Float32Array, counted: Float32Array, air_m: Float32Array, limits: Limits
+) -> tuple[Echo, Echo]:
     """Return the stronger and the weaker of the dimmed surface and the air.
 
     Args:
@@ -233,6 +243,7 @@ def _rank(echo: Echo, depth: Float32Array, counted: Float32Array, air_m: Float32
         depth: (N,) optical depth of the air before it.
         counted: (N,) photons of the air; fewer than one are none.
         air_m: (N,) range of the air's echo, metres.
+        limits: The ranges at which the receiver listens.
     """
     shape = echo.range_m.shape
     surface = replace(echo, photons=echo.photons * np.exp(-2 * depth).reshape(shape))
@@ -246,5 +257,5 @@ def _rank(echo: Echo, depth: Float32Array, counted: Float32Array, air_m: Float32
         cosine=is_there.astype(np.float32),
         geom=np.where(is_there, np.int32(AIR), np.int32(-1)),
     )
-    is_air = light > surface.photons
+    is_air = outweighs(air, surface, limits)
     return choose_echo(is_air, air, surface), choose_echo(is_air, surface, air)

@@ -21,6 +21,7 @@ def blend_on_device(
     bundle: Bundle,
     weights: Float64Array,
     pulse_m: float,
+    limits_m: tuple[float, float],
 ) -> tuple[Float32Array, Int32Array]:
     """Cast several rays over the width of every beam and blend their echoes, all on the device.
 
@@ -33,6 +34,7 @@ def blend_on_device(
         bundle: The n rays of a beam.
         weights: (n,) share of the light of each.
         pulse_m: Echoes that follow one another by less are one group.
+        limits_m: Least and greatest range at which the receiver listens.
 
     Returns:
         (5, W, H) range, photons, cosine, true range and owner's share as in `Echo`; (2, W, H) geom and owner.
@@ -45,6 +47,7 @@ def blend_on_device(
         photons = wp.empty((n_rays, n_beams), dtype=wp.float32, device=caster.device)
         told = [caster.put(reflectivity, wp.float32), caster.put(weights.astype(np.float32), wp.float32), beam_origin_m]
         wp.launch(kernels.shine, (n_rays, n_beams), inputs=[*told, *hits, photons], device=caster.device)
+        wp.launch(kernels.drop_unheard, n_beams, inputs=[*limits_m, pulse_m, *hits, photons], device=caster.device)
         echo = wp.empty((5, n_beams), dtype=wp.float32, device=caster.device)
         names = wp.empty((2, n_beams), dtype=wp.int32, device=caster.device)
         told = [caster.put(owners, wp.int32), pulse_m, *hits, photons]

@@ -24,6 +24,26 @@ DIVERGENCE_RAD = np.deg2rad(0.18)
 PULSE_M = 1.0
 
 
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """The ranges at which the receiver listens, metres: an echo outside is not reported, and hides none within.
+
+    Attributes:
+        least_m: The least range.
+        most_m: The greatest range.
+    """
+
+    least_m: float
+    most_m: float
+
+    def hold(self, range_m: Float32Array) -> BoolArray:
+        """Return which ranges (...) lie within the limits."""
+        return np.asarray((range_m >= self.least_m) & (range_m <= self.most_m))
+
+
+EVERYWHERE = Limits(0.0, float("inf"))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Echo:
     """The light that returns to each pixel of a revolution, before the receiver measures it. All arrays (W, H).
@@ -66,9 +86,15 @@ def no_echo(like: Echo) -> Echo:
     )
 
 
-def stronger_echo(one: Echo, other: Echo) -> Echo:
-    """Return the echo of either that has more photons, pixel by pixel; `one` where they have as many."""
-    return choose_echo(other.photons > one.photons, other, one)
+def outweighs(one: Echo, other: Echo, limits: Limits) -> BoolArray:
+    """Return where (W, H) one echo is reported before another: it alone lies within the limits, or has more photons."""
+    is_in, other_is_in = ((each.photons > 0) & limits.hold(each.range_m) for each in (one, other))
+    return np.where(is_in == other_is_in, one.photons > other.photons, is_in)
+
+
+def stronger_echo(one: Echo, other: Echo, limits: Limits) -> Echo:
+    """Return the echo that outweighs the other, pixel by pixel; `one` where neither does."""
+    return choose_echo(outweighs(other, one, limits), other, one)
 
 
 def choose_echo(mask: BoolArray, chosen: Echo, other: Echo) -> Echo:
@@ -104,9 +130,18 @@ class BeamHits:
 
 
 def cast_beams(
-    caster: RayCaster, reflectivity: Float32Array, rays: Rays, beam_origin_m: float, sub_rays: Literal[7, 19]
+    caster: RayCaster,
+    reflectivity: Float32Array,
+    rays: Rays,
+    beam_origin_m: float,
+    sub_rays: Literal[7, 19],
+    limits: Limits = EVERYWHERE,
 ) -> BeamHits:
-    """Cast several rays over the width of every beam at geoms of these reflectivities (G,)."""
+    """Cast several rays over the width of every beam at geoms of these reflectivities (G,).
+
+    Where a beam meets surfaces a pulse or more apart, within the limits and outside, rays that meet those outside
+    become misses.
+    """
     places, weights = sub_ray_pattern(sub_rays)
     ranges_m, geoms, cosines = caster.cast_bundles(rays.origins, rays.directions, beam_bundle(places))
     ranges_m += np.float32(beam_origin_m)
@@ -114,7 +149,20 @@ def cast_beams(
     for ray, weight in enumerate(weights):
         power = reflected_share(reflectivity, geoms[ray], cosines[ray])
         photons[ray] = np.float32(weight) * received_photons(power, ranges_m[ray])
-    return BeamHits(ranges_m, photons, geoms, cosines)
+    return _drop_unheard(BeamHits(ranges_m, photons, geoms, cosines), limits)
+
+
+def _drop_unheard(hits: BeamHits, limits: Limits) -> BeamHits:
+    """Let rays miss what lies outside the limits, in place, where `cast_beams` says so."""
+    is_in = limits.hold(hits.ranges_m)
+    is_out = np.isfinite(hits.ranges_m) & ~is_in
+    if is_out.any():
+        nearest_m = hits.ranges_m.min(axis=0)
+        farthest_m = np.where(np.isinf(hits.ranges_m), np.float32(0.0), hits.ranges_m).max(axis=0)
+        is_in &= hits.photons > 0
+        is_out &= is_in.any(axis=0) & (farthest_m - nearest_m >= PULSE_M)
+        hits.ranges_m[is_out], hits.photons[is_out], hits.geoms[is_out], hits.cosines[is_out] = np.inf, 0.0, -1, 0.0
+    return hits
 
 
 def spread_echo(
@@ -124,6 +172,7 @@ def spread_echo(
     beam_origin_m: float,
     owners: Int32Array,
     sub_rays: Literal[7, 19],
+    limits: Limits = EVERYWHERE,
 ) -> Echo:
     """Cast several rays over the width of every beam and return the echo that they blend into (`blend_beams`)."""
     if caster.keeps_hits and not (reflectivity >= RETRO_FROM).any():
@@ -131,10 +180,11 @@ def spread_echo(
 
         places, weights = sub_ray_pattern(sub_rays)
         told = cast(Any, caster), reflectivity, rays, beam_origin_m, owners, beam_bundle(places), weights, PULSE_M
-        light, (geom, owner) = blend_on_device(*told)
+        limits_m = limits.least_m, limits.most_m
+        light, (geom, owner) = blend_on_device(*told, limits_m)
         range_m, photons, cosine, true_range_m, share = light
         return Echo(range_m, photons, cosine, true_range_m, geom, owner, share)
-    hits = cast_beams(caster, reflectivity, rays, beam_origin_m, sub_rays)
+    hits = cast_beams(caster, reflectivity, rays, beam_origin_m, sub_rays, limits)
     return blend_beams(hits, owners, rays.directions.shape[:2])
 
 

@@ -8,7 +8,7 @@ light outshines reports nothing, or, more rarely, a point at the reflector's ran
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -27,21 +27,7 @@ _STEEPEST_DEG = 85.0
 # Of the beams that stray light outshines, how many report it; the vendor's firmware suppresses most of it since 1.12
 # (ouster-sdk issue 61). Ours, unverified.
 REPORTED_SHARE = 0.2
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Stray:
-    """Stray light in N pixels.
-
-    Attributes:
-        pixel: (N,) flat numbers of the pixels, rising, each once.
-        photons: (N,) float32 what all reflectors together send there.
-        range_m: (N,) float32 range of the one that sends most.
-    """
-
-    pixel: Int64Array
-    photons: Float32Array
-    range_m: Float32Array
+_BLOCK_PAIRS = 1 << 17  # of a source and a pixel that are looked at together
 
 
 def add_glare(
@@ -60,11 +46,8 @@ def add_glare(
     is_source = (echo.geom >= 0) & is_reflector[np.maximum(echo.geom, 0)] & (echo.photons > 0)
     if not is_source.any():
         return echo, second
-    stray = _spread_light(echo, is_source, rays, sensor)
-    is_outshone = (stray.photons > echo.photons.ravel()[stray.pixel]) & ~is_source.ravel()[stray.pixel]
-    light, range_m = np.zeros_like(echo.photons), np.zeros_like(echo.range_m)
-    light.flat[stray.pixel[is_outshone]] = stray.photons[is_outshone]
-    range_m.flat[stray.pixel[is_outshone]] = stray.range_m[is_outshone]
+    stray, range_m = _spread_light(echo, is_source, rays, sensor)
+    light = np.where((stray > echo.photons) & ~is_source, stray, np.float32(0.0))
     is_told = (light > 0) & (draw < REPORTED_SHARE)
     halo = replace(
         no_echo(echo),
@@ -79,29 +62,57 @@ def add_glare(
     )
 
 
-def _spread_light(echo: Echo, is_source: BoolArray, rays: Rays, sensor: SensorMetadata) -> _Stray:
-    """Return the light that strays from some pixels (W, H) to those around them."""
-    source_column, source_row = np.nonzero(is_source)
+def _spread_light(
+    echo: Echo, is_source: BoolArray, rays: Rays, sensor: SensorMetadata
+) -> tuple[Float32Array, Float32Array]:
+    """Return the light that strays from some pixels (W, H) to all others, and the range of the one that sends most.
+
+    Both (W, H); sources are taken in blocks, so that memory does not grow with their number.
+    """
+    sources = np.flatnonzero(is_source)
     row_step, turn = _neighbours(sensor)
+    total, most, range_m = np.zeros(is_source.size), *np.zeros((2, is_source.size), np.float32)
+    n_block = max(_BLOCK_PAIRS // (len(row_step) * len(turn)), 1)
+    for first in range(0, len(sources), n_block):
+        source, pixel, angle_deg = _find_lit(sources[first : first + n_block], is_source, rays, sensor)
+        light = echo.photons.ravel()[source] * STRAY_AT_1_DEG / np.square(angle_deg)
+        np.add.at(total, pixel, light.astype(np.float64))
+        np.maximum.at(most, pixel, light)
+        is_most = light == most[pixel]  # of equal ones the last
+        range_m[pixel[is_most]] = echo.range_m.ravel()[source[is_most]]
+    return total.astype(np.float32).reshape(is_source.shape), range_m.reshape(is_source.shape)
+
+
+def _find_lit(
+    sources: Int64Array, is_source: BoolArray, rays: Rays, sensor: SensorMetadata
+) -> tuple[Int64Array, Int64Array, Float32Array]:
+    """Return the pairs of a source and a pixel that its stray light reaches.
+
+    Args:
+        sources: (N,) flat numbers of pixels that send light.
+        is_source: (W, H) all pixels that do: they look at a reflector, so stray light is lost on them.
+        rays: The revolution's rays.
+        sensor: Its beam table.
+
+    Returns:
+        (P,) flat numbers of the sources, in their order; (P,) of the pixels; (P,) float32 angles between them, degrees.
+    """
     height, width = sensor.height, sensor.width
+    row_step, turn = _neighbours(sensor)
     shift = np.asarray(sensor.pixel_shift)
-    row = (source_row[:, None] + row_step)[:, :, None]
-    is_there = (row >= 0) & (row < height)
-    row = np.clip(row, 0, height - 1)
-    column = (source_column[:, None, None] + shift[source_row][:, None, None] - shift[row] + turn) % width
-    row, is_there = np.broadcast_arrays(row, column)[0], np.broadcast_to(is_there, column.shape)
-    ways = rays.directions[column, row]
-    facing = (ways * rays.directions[source_column, source_row][:, None, None]).sum(axis=-1)
+    source_column, source_row = np.divmod(sources, height)
+    row = source_row[:, None] + row_step
+    one, step = np.nonzero((row >= 0) & (row < height))
+    row = row[one, step]
+    column = ((source_column + shift[source_row])[one, None] - shift[row][:, None] + turn) % width
+    pixel = column * height + row[:, None]
+    is_rock = ~is_source.ravel()[pixel]
+    source, pixel = sources[one[np.nonzero(is_rock)[0]]], pixel[is_rock]
+    ways = rays.directions.reshape(-1, 3)
+    facing = (ways[pixel] * ways[source]).sum(axis=-1)
     angle_deg = np.degrees(np.arccos(np.clip(facing, -1.0, 1.0)))
-    is_lit = is_there & (angle_deg > 0) & (angle_deg <= REACH_DEG)
-    source, *_ = np.nonzero(is_lit)
-    light = echo.photons[source_column, source_row][source] * STRAY_AT_1_DEG / np.square(angle_deg[is_lit])
-    pixel = column[is_lit] * height + row[is_lit]
-    order = np.lexsort((light, pixel))
-    last = np.flatnonzero(np.append(np.diff(pixel[order]) > 0, True))  # of each pixel, the one that gives most light
-    total = np.bincount(pixel, light, echo.range_m.size)[pixel[order][last]]
-    range_m = echo.range_m[source_column, source_row][source][order][last]
-    return _Stray(pixel[order][last], total.astype(np.float32), range_m)
+    is_lit = (angle_deg > 0) & (angle_deg <= REACH_DEG)
+    return source[is_lit], pixel[is_lit], angle_deg[is_lit]
 
 
 @lru_cache(maxsize=4)

@@ -13,7 +13,16 @@ import numpy.typing as npt
 
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 from sim.geometry.raycast import Caster
-from sim.sensor.footprint import Echo, choose_echo, no_echo, replace_pixels, stronger_echo
+from sim.sensor.footprint import (
+    EVERYWHERE,
+    Echo,
+    Limits,
+    choose_echo,
+    no_echo,
+    outweighs,
+    replace_pixels,
+    stronger_echo,
+)
 from sim.sensor.optics import MIRRORED, mirrored_share, received_photons, reflected_share
 from sim.sensor.rays import Rays
 
@@ -65,7 +74,9 @@ class _Beams:
         return np.asarray(np.minimum(np.abs((self.way * self.normal).sum(axis=1)), 1.0))
 
 
-def cross_glass(echo: Echo, rays: Rays, beam_origin_m: float, panes: Panes) -> tuple[Echo, Echo]:
+def cross_glass(
+    echo: Echo, rays: Rays, beam_origin_m: float, panes: Panes, limits: Limits = EVERYWHERE
+) -> tuple[Echo, Echo]:
     """Return the strongest and the second echo of a revolution where beams meet glass.
 
     Args:
@@ -73,6 +84,7 @@ def cross_glass(echo: Echo, rays: Rays, beam_origin_m: float, panes: Panes) -> t
         rays: The revolution's rays; the middle of a beam decides for the whole beam.
         beam_origin_m: Distance of their origins from the spin axis.
         panes: The panes, and what is seen in them.
+        limits: The ranges at which the receiver listens.
 
     Returns:
         The strongest echo; and the second one of the beams that meet glass, nothing for all other beams.
@@ -81,8 +93,8 @@ def cross_glass(echo: Echo, rays: Rays, beam_origin_m: float, panes: Panes) -> t
     beams = _find_beams(echo, rays, beam_origin_m, panes)
     if len(beams.pixel):
         for found in (_look_through(echo, beams, panes), _look_back(echo, beams, panes)):
-            is_stronger = found.photons > first.photons
-            second = stronger_echo(second, choose_echo(is_stronger, first, found))
+            is_stronger = outweighs(found, first, limits)
+            second = stronger_echo(second, choose_echo(is_stronger, first, found), limits)
             first = choose_echo(is_stronger, found, first)
     return first, second
 

@@ -34,6 +34,36 @@ def shine(
         photons[ray, beam] = weights[ray] * (reflectivity[geoms[ray, beam]] * cosines[ray, beam] * white)
 
 
+@wp.kernel
+def drop_unheard(
+    least_m: wp.float32,
+    most_m: wp.float32,
+    pulse_m: wp.float32,
+    ranges_m: wp.array2d(dtype=wp.float32),
+    geoms: wp.array2d(dtype=wp.int32),
+    cosines: wp.array2d(dtype=wp.float32),
+    photons: wp.array2d(dtype=wp.float32),
+) -> None:
+    """Let rays of beams (N,) miss what lies outside the limits, where `sim.sensor.footprint.cast_beams` says so."""
+    beam = wp.tid()
+    nearest_m, farthest_m = wp.float32(wp.inf), wp.float32(0.0)
+    n_in = wp.int32(0)
+    for ray in range(ranges_m.shape[0]):
+        range_m = ranges_m[ray, beam]
+        if geoms[ray, beam] >= 0:
+            nearest_m = wp.min(nearest_m, range_m)
+            farthest_m = wp.max(farthest_m, range_m)
+            if range_m >= least_m and range_m <= most_m and photons[ray, beam] > 0.0:
+                n_in += 1
+    if n_in > 0 and farthest_m - nearest_m >= pulse_m:
+        for ray in range(ranges_m.shape[0]):
+            if ranges_m[ray, beam] < least_m or ranges_m[ray, beam] > most_m:
+                ranges_m[ray, beam] = wp.inf
+                geoms[ray, beam] = -1
+                cosines[ray, beam] = 0.0
+                photons[ray, beam] = 0.0
+
+
 @wp.func
 def find_strongest(
     beam: wp.int32, pulse_m: wp.float32, ranges_m: wp.array2d(dtype=wp.float32), photons: wp.array2d(dtype=wp.float32)

@@ -17,12 +17,14 @@ from sim.sensor.air import AirVolume, cross_air, dim_echo
 from sim.sensor.footprint import (
     PULSE_M,
     Echo,
+    Limits,
     blend_beams,
     cast_beams,
     central_echo,
     choose_echo,
     drop_strongest,
     no_echo,
+    outweighs,
     spread_echo,
     stronger_echo,
 )
@@ -126,22 +128,23 @@ def scan(
     """
     reflectivity = scene.reflectivity if settings.retroreflectors else as_white(scene.reflectivity)
     surfaces = scene.caster, reflectivity, rays, sensor.beam_origin_m
+    limits = _range_limits(settings)
     echo, second = _see_surfaces(surfaces, scene.instance if owners is None else owners, settings)
     if water is not None:
-        echo, other = cross_water(echo, rays, sensor.beam_origin_m, water)
+        echo, other = cross_water(echo, rays, sensor.beam_origin_m, water, limits)
         if second is not None:
-            second = stronger_echo(look_through_water(second, rays, sensor.beam_origin_m, water), other)
+            second = stronger_echo(look_through_water(second, rays, sensor.beam_origin_m, water), other, limits)
     if panes is not None:
-        echo, other = cross_glass(echo, rays, sensor.beam_origin_m, panes)
-        second = None if second is None else stronger_echo(second, other)
+        echo, other = cross_glass(echo, rays, sensor.beam_origin_m, panes, limits)
+        second = None if second is None else stronger_echo(second, other, limits)
     if air is not None:
         returns = stream(seed, session, "air-returns", str(number))
         if second is not None:
             second = dim_echo(second, rays, sensor.beam_origin_m, air)
-        echo, other = cross_air(echo, rays, sensor.beam_origin_m, air, returns)
-        second = None if second is None else stronger_echo(second, other)
+        echo, other = cross_air(echo, rays, sensor.beam_origin_m, air, returns, limits)
+        second = None if second is None else stronger_echo(second, other, limits)
     if second is not None:  # what was the stronger one may have been dimmed more
-        is_stronger = second.photons > echo.photons
+        is_stronger = outweighs(second, echo, limits)
         echo, second = choose_echo(is_stronger, second, echo), choose_echo(is_stronger, echo, second)
     if settings.retroreflectors:
         draw = stream(seed, session, "glare", str(number)).random(echo.range_m.shape, dtype=np.float32)
@@ -176,19 +179,25 @@ def _see_surfaces(
     Args:
         surfaces: Caster, reflectivity (G,), rays, and the distance of their origins from the spin axis.
         owners: (G,) owner of each geom.
-        settings: Number of rays in a beam, and of returns.
+        settings: Number of rays in a beam, and of returns; range limits.
     """
-    has_second = settings.returns != "strongest"
+    has_second, limits = settings.returns != "strongest", _range_limits(settings)
     if settings.sub_rays == 1:
         echo = central_echo(*surfaces, owners)
         return echo, no_echo(echo) if has_second else None
     if not has_second:
-        return spread_echo(*surfaces, owners, settings.sub_rays), None
-    hits = cast_beams(*surfaces, settings.sub_rays)
+        return spread_echo(*surfaces, owners, settings.sub_rays, limits), None
+    hits = cast_beams(*surfaces, settings.sub_rays, limits)
     first, second = (
         blend_beams(each, owners, surfaces[2].directions.shape[:2]) for each in (hits, drop_strongest(hits))
     )
     return first, second
+
+
+def _range_limits(settings: Sensor) -> Limits:
+    """Return the ranges that a sensor reports."""
+    # a range of 0 says that there is no return
+    return Limits(max(settings.min_range_m, settings.range_step_mm / 1000.0), settings.max_range_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,9 +231,7 @@ def _measure(echo: Echo, settings: Sensor, purpose: tuple[int, str, str], number
         noise = stream(seed, session, f"{prefix}range-noise", str(number)).standard_normal(shape, dtype=np.float32)
         noise *= range_sigma_m(range_m, photons, echo.cosine)
         range_m = range_m + noise
-    # a range of 0 says that there is no return
-    least_m = max(settings.min_range_m, settings.range_step_mm / 1000.0)
-    is_return = (echo.geom != MISS) & (range_m >= least_m) & (range_m <= settings.max_range_m)
+    is_return = (echo.geom != MISS) & _range_limits(settings).hold(range_m)
     if settings.dropouts:
         draw = stream(seed, session, f"{prefix}dropouts", str(number)).random(shape, dtype=np.float32)
         is_return &= draw < detection_probability(photons)
@@ -253,7 +260,7 @@ def _arrange(first: _Return, second: _Return) -> list[_Return]:
 def _report_nothing_there(parts: Sequence[_Return], settings: Sensor, generator: np.random.Generator) -> None:
     """Let some pixels report a return where nothing is, and no second one, in place."""
     first, *others = parts
-    least_m = min(max(settings.min_range_m, settings.range_step_mm / 1000.0), settings.max_range_m)
+    least_m = min(_range_limits(settings).least_m, settings.max_range_m)
     pixels, places_m = false_returns(generator, first.geom.size, least_m, settings.max_range_m)
     first.geom.flat[pixels], first.range_m.flat[pixels], first.photons.flat[pixels] = (
         FALSE_RETURN, places_m, FALSE_PHOTONS

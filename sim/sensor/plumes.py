@@ -14,7 +14,8 @@ import numpy as np
 from cdpipe.core.geometry import Float32Array, Float64Array
 
 # All ours, unverified: width of a wake and the height of its middle, turbulent diffusivity in a ventilated drift, and
-# the time in which 63 % settle (grains of 10 um sink 2 m in about as long, by Stokes).
+# the time in which 63 % settle. By Stokes, quartz grains 14 um in diameter sink 2 m in about that time; those of 10 um
+# take 250 s.
 WAKE_SIGMA_M, WAKE_HEIGHT_M = 0.8, 0.6
 DIFFUSIVITY_M2_PER_S = 0.05
 SETTLING_S = 120.0

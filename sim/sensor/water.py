@@ -16,7 +16,7 @@ import numpy as np
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
 from sim.geometry.raycast import Caster
 from sim.placement.puddles import Pool
-from sim.sensor.footprint import Echo, choose_echo, no_echo, replace_pixels
+from sim.sensor.footprint import EVERYWHERE, Echo, Limits, choose_echo, no_echo, outweighs, replace_pixels
 from sim.sensor.optics import MIRRORED, mirrored_share, received_photons
 from sim.sensor.rays import Rays
 
@@ -42,7 +42,9 @@ class Water:
     reflectivity: Float32Array
 
 
-def cross_water(echo: Echo, rays: Rays, beam_origin_m: float, water: Water) -> tuple[Echo, Echo]:
+def cross_water(
+    echo: Echo, rays: Rays, beam_origin_m: float, water: Water, limits: Limits = EVERYWHERE
+) -> tuple[Echo, Echo]:
     """Return the stronger and the weaker echo of a revolution where beams meet water before anything else.
 
     Args:
@@ -50,6 +52,7 @@ def cross_water(echo: Echo, rays: Rays, beam_origin_m: float, water: Water) -> t
         rays: The revolution's rays; the middle of a beam decides for the whole beam.
         beam_origin_m: Distance of their origins from the spin axis.
         water: The pools, and what they mirror.
+        limits: The ranges at which the receiver listens.
 
     Returns:
         The stronger echo; and the other one of the beams that meet water, nothing for all other beams.
@@ -71,7 +74,7 @@ def cross_water(echo: Echo, rays: Rays, beam_origin_m: float, water: Water) -> t
     ghost = replace_pixels(
         no_echo(echo), wet, range_m=total_m, photons=light, cosine=facing, geom=np.where(is_met, MIRRORED, -1)
     )
-    is_ghost = ghost.photons > floor.photons
+    is_ghost = outweighs(ghost, floor, limits)
     is_wet = np.zeros(echo.range_m.size, dtype=np.bool_)
     is_wet[wet] = True
     other = choose_echo(is_ghost, floor, ghost)

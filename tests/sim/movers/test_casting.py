@@ -112,3 +112,32 @@ def test_the_nearer_of_a_mover_and_a_wall_is_met(sensor: SensorMetadata, make_bo
     assert not (behind[1] >= 2).any()  # the screen stands between sensor and person
     free = MovingCaster(Caster([floor]), 1, [mover], time_s).cast_columns(rays.origins, rays.directions)
     assert (free[1] >= 1).any()
+
+
+@pytest.mark.parametrize(("keeps_hits", "n_calls"), [(False, 4), (True, 1)])
+def test_bundles_at_movers_are_cast_a_block_of_columns_at_a_time_but_at_once_on_a_device(
+    keeps_hits: bool,
+    n_calls: int,
+    sensor: SensorMetadata,
+    make_body: MakeBody,
+    floor: Mesh,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rays, time_s = columns_of(sensor, 1.0)
+    bundle, fixed = beam_bundle(sub_ray_pattern(7)[0]), Caster([floor])
+    fixed.keeps_hits = keeps_hits
+    movers = [make_body("person", 1), make_body("forklift", 2, 1.7)]
+    local = make_bundle_rays(rays.origins, rays.directions, bundle, fixed.centre_m)
+    want = MovingCaster(fixed, 1, movers, time_s).cast_local(*local)
+    n_rays, cast = [], fixed.cast_local
+
+    def counted(origins: Float32Array, directions: Float32Array) -> Hits:
+        n_rays.append(len(origins))
+        return cast(origins, directions)
+
+    monkeypatch.setattr(fixed, "cast_local", counted)
+    got = MovingCaster(fixed, 1, movers, time_s).cast_bundles(rays.origins, rays.directions, bundle)
+    assert n_rays == [7 * sensor.height * sensor.width // n_calls] * n_calls
+    assert (got[1] > 0).sum() > 50  # the movers are met
+    for mine, whole in zip(got, want, strict=True):
+        np.testing.assert_array_equal(mine, whole.reshape(-1, 7).T)

@@ -16,7 +16,7 @@ from sim.geometry.mesh import Mesh, box_mesh
 from sim.geometry.raycast import Caster
 from sim.scene import Scene
 from sim.sensor.air import AIR, DUST_M2_PER_MG, DUST_RATIO_SR, MIST_RATIO_SR, AirVolume, air_around, cross_air
-from sim.sensor.footprint import Echo, central_echo
+from sim.sensor.footprint import Echo, Limits, central_echo
 from sim.sensor.lidar import MISS, Scan, scan
 from sim.sensor.optics import received_photons
 from sim.sensor.rays import Rays, revolution_rays
@@ -131,6 +131,63 @@ def test_the_air_hides_no_more_than_it_must(sensor: SensorMetadata) -> None:
 
     seen = [shares(visibility_m)[0] for visibility_m in (8.0, 15.0, 30.0, 100.0)]
     assert seen == sorted(seen) and seen[0] < 0.2 and seen[-1] > 0.9
+
+
+@pytest.mark.parametrize(("least_m", "most_m"), [(0.25, 0.75), (0.5, 1.0), (0.5, 1.5)])
+def test_only_the_air_within_the_range_limits_competes(sensor: SensorMetadata, least_m: float, most_m: float) -> None:
+    black, rays, origin_m, alpha = room(half_m=60.0, reflectivity=1e-9), still(sensor), sensor.beam_origin_m, 1.0
+    clear = central_echo(black.caster, black.reflectivity, rays, origin_m, black.instance)
+    limits = Limits(least_m + origin_m, most_m + origin_m)
+    told, _ = cross_air(clear, rays, origin_m, AirVolume(alpha), stream(1, "air-returns"), limits)
+    is_air = told.geom == AIR
+    assert is_air.mean() > 0.97
+    told_m = told.range_m[is_air]
+    assert told_m.min() == pytest.approx(limits.least_m, abs=0.01)
+    assert told_m.max() == pytest.approx(limits.most_m, abs=0.01)
+    # pieces of one metre each, all of them nearer than 3 m, where a percent of reflectivity gives the same light
+    edges_m = np.array([least_m, *np.arange(np.floor(least_m) + 1, most_m), most_m])
+    power = np.pi * alpha / MIST_RATIO_SR * np.diff(edges_m) * np.exp(-alpha * (edges_m[1:] + edges_m[:-1]))
+    expected = received_photons(power.astype(np.float32), np.full(len(power), 2.0, np.float32))
+    counts = np.random.default_rng(0).poisson(expected, (200_000, len(power))).max(axis=1)
+    assert told.photons[is_air].mean() == pytest.approx(counts[counts >= 1].mean(), rel=0.03)
+
+
+def test_a_least_range_moves_the_echo_only_where_it_lay_below(sensor: SensorMetadata) -> None:
+    scene, rays, origin_m = room(half_m=3.0), still(sensor), sensor.beam_origin_m
+    clear = central_echo(scene.caster, scene.reflectivity, rays, origin_m, scene.instance)
+    drawn = clear, rays, origin_m, AirVolume(np.log(20) / 10.0)
+    free, _ = cross_air(*drawn, stream(1, "air-returns"))
+    told, _ = cross_air(*drawn, stream(1, "air-returns"), Limits(0.8, 120.0))
+    is_first_metre = (free.geom == AIR) & (free.range_m < 1.0 + origin_m)
+    is_below = (free.geom == AIR) & (free.range_m < 0.8)
+    assert is_below.mean() > 0.05
+    assert (told.geom[is_below] == 0).mean() > 0.05
+    assert (told.range_m >= np.float32(0.8)).all()
+    for name in ("range_m", "photons", "geom"):
+        np.testing.assert_array_equal(getattr(told, name)[~is_first_metre], getattr(free, name)[~is_first_metre])
+    is_wall = told.geom == 0
+    np.testing.assert_array_equal(told.range_m[is_wall], clear.range_m[is_wall])
+    dimmed = clear.photons[is_wall] * 20.0 ** (-2 * (clear.range_m[is_wall] - origin_m) / 10.0)
+    np.testing.assert_allclose(told.photons[is_wall], dimmed, rtol=1e-3)  # air that is not heard dims all the same
+
+
+@pytest.mark.parametrize(("least_m", "most_m"), [(0.3, 120.0), (0.8, 120.0), (2.0, 6.0)])
+def test_one_return_is_the_first_of_two_and_no_beam_loses_what_lies_within_the_limits(
+    sensor: SensorMetadata, least_m: float, most_m: float
+) -> None:
+    def seen(returns: str) -> Scan:
+        limits = {"min_range_m": least_m, "max_range_m": most_m, "returns": returns}
+        settings = IDEAL.model_copy(update=limits)
+        return scan(room(), sensor, settings, still(sensor), 1, "after", 0, air=AirVolume(np.log(20) / 12.0))
+
+    strongest, dual, last = (seen(each) for each in ("strongest", "dual", "last"))
+    first, second = np.split(dual.range_mm, 2)
+    assert (strongest.geom == AIR).mean() > 0.1
+    np.testing.assert_array_equal(strongest.range_mm, first)
+    np.testing.assert_array_equal(strongest.geom, np.split(dual.geom, 2)[0])
+    np.testing.assert_array_equal(last.range_mm, np.maximum(first, second))
+    if most_m > 20:  # all walls are within
+        assert (strongest.geom != MISS).all()
 
 
 def test_swathes_keep_the_mean_and_drift_with_the_air() -> None:

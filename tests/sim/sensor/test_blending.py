@@ -11,7 +11,7 @@ import pytest
 
 from cdpipe.core.geometry import Float32Array, Int32Array
 from sim.geometry.mesh import Mesh
-from sim.sensor.footprint import Echo, blend_beams, cast_beams, spread_echo
+from sim.sensor.footprint import EVERYWHERE, Echo, Limits, blend_beams, cast_beams, spread_echo
 from sim.sensor.optics import RETRO_FROM
 from sim.sensor.rays import Rays
 
@@ -60,23 +60,37 @@ def fan() -> Rays:
 
 
 def blend_by_numpy(
-    warp: WarpCaster, reflectivity: Float32Array, owners: Int32Array, sub_rays: Literal[7, 19]
+    warp: WarpCaster,
+    reflectivity: Float32Array,
+    owners: Int32Array,
+    sub_rays: Literal[7, 19],
+    limits: Limits = EVERYWHERE,
 ) -> tuple[Echo, Int32Array]:
     """Return the echo, and how many groups of rays each beam has."""
-    hits = cast_beams(warp, reflectivity, fan(), ORIGIN_M, sub_rays)
+    hits = cast_beams(warp, reflectivity, fan(), ORIGIN_M, sub_rays, limits)
     reach_m = np.sort(np.where(np.isinf(hits.ranges_m), np.nan, hits.ranges_m), axis=0)
     n_groups = (np.diff(reach_m, axis=0) >= 1.0).sum(axis=0) + np.isfinite(reach_m).any(axis=0)
     return blend_beams(hits, owners, (400, 7)), n_groups.astype(np.int32)
 
 
+@pytest.mark.parametrize(
+    ("limits", "counts"), [(EVERYWHERE, {0, 1, 2, 3}), (Limits(0.3, 11.0), {0, 1, 2}), (Limits(9.0, 14.0), {0, 1, 2})]
+)
 @pytest.mark.parametrize("sub_rays", SUB_RAYS)
 def test_a_beam_blends_as_with_numpy(
-    warp: WarpCaster, surfaces: tuple[Float32Array, Int32Array], sub_rays: Literal[7, 19]
+    warp: WarpCaster,
+    surfaces: tuple[Float32Array, Int32Array],
+    sub_rays: Literal[7, 19],
+    limits: Limits,
+    counts: set[int],
 ) -> None:
     reflectivity, owners = surfaces
-    want, n_groups = blend_by_numpy(warp, reflectivity, owners, sub_rays)
-    got = spread_echo(warp, reflectivity, fan(), ORIGIN_M, owners, sub_rays)
-    assert set(np.unique(n_groups)) >= {0, 1, 2, 3}
+    want, n_groups = blend_by_numpy(warp, reflectivity, owners, sub_rays, limits)
+    got = spread_echo(warp, reflectivity, fan(), ORIGIN_M, owners, sub_rays, limits)
+    assert set(np.unique(n_groups)) >= counts
+    if limits != EVERYWHERE:
+        free = spread_echo(warp, reflectivity, fan(), ORIGIN_M, owners, sub_rays)
+        assert (free.geom != got.geom).sum() > 20
     assert (want.owner_share[want.geom >= 0] < 0.95).any()
     is_hit = want.geom >= 0
     np.testing.assert_array_equal(got.geom, want.geom)

@@ -11,9 +11,12 @@ from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 from sim.sensor.footprint import (
     DIVERGENCE_RAD,
+    EVERYWHERE,
     PULSE_M,
     WAIST_M,
     Echo,
+    Limits,
+    beam_bundle,
     blend_echoes,
     central_echo,
     divide_light,
@@ -45,9 +48,9 @@ def one_ray(*meshes: Mesh) -> Echo:
     return central_echo(Caster(meshes), np.full(len(meshes), 0.3, np.float32), fan(), 0.015, each_its_own(meshes))
 
 
-def many_rays(sub_rays: Literal[7, 19], *meshes: Mesh) -> Echo:
+def many_rays(sub_rays: Literal[7, 19], *meshes: Mesh, limits: Limits = EVERYWHERE) -> Echo:
     reflectivity = np.full(len(meshes), 0.3, np.float32)
-    return spread_echo(Caster(meshes), reflectivity, fan(), 0.015, each_its_own(meshes), sub_rays)
+    return spread_echo(Caster(meshes), reflectivity, fan(), 0.015, each_its_own(meshes), sub_rays, limits)
 
 
 def each_its_own(meshes: tuple[Mesh, ...]) -> Int32Array:
@@ -200,6 +203,25 @@ def test_a_scene_and_its_beams_tilted_together_give_the_same_echoes(sub_rays: Li
     off = np.abs(echoes[0].range_m - echoes[1].range_m)
     assert np.sort(off, axis=None)[:-4].max() < 2e-4
     assert (echoes[0].geom != echoes[1].geom).sum() <= 4
+
+
+@pytest.mark.parametrize(("limits", "other"), [(Limits(12.0, 120.0), 1), (Limits(0.3, 12.0), 0)])
+@pytest.mark.parametrize("sub_rays", [7, 19])
+def test_a_surface_outside_the_limits_hides_none_within(sub_rays: Literal[7, 19], limits: Limits, other: int) -> None:
+    meshes = step(5.0)
+    places, weights = sub_ray_pattern(sub_rays)
+    ranges_m, geoms, cosines = Caster(meshes).cast_bundles(fan().origins, fan().directions, beam_bundle(places))
+    light = weights[:, None] * received_photons(0.3 * cosines, ranges_m + np.float32(0.015))
+    reaches = (geoms == other).any(axis=0)
+    free, told = many_rays(sub_rays, *meshes), many_rays(sub_rays, *meshes, limits=limits)
+    assert (free.geom[reaches, 0] != other).sum() > 20  # the other surface sends more light
+    assert (told.geom[reaches, 0] == other).all()
+    within = np.where(geoms == other, light, 0.0).sum(axis=0)
+    np.testing.assert_allclose(told.photons[reaches, 0], within[reaches], rtol=1e-5)
+    np.testing.assert_array_equal(told.range_m[~reaches], free.range_m[~reaches])  # the receiver gates these later
+    # a single group that straddles a limit stays whole
+    near = many_rays(sub_rays, *step(0.5)), many_rays(sub_rays, *step(0.5), limits=Limits(0.3, 10.2))
+    np.testing.assert_array_equal(near[0].range_m, near[1].range_m)
 
 
 def brute_force(ranges_m: Float64Array, photons: Float64Array) -> tuple[float, float]:

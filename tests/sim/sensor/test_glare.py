@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from sim.geometry.mesh import Mesh, box_mesh
 from sim.geometry.raycast import Caster
 from sim.materials import REFLECTIVITY
 from sim.scene import Scene
+from sim.sensor import glare
 from sim.sensor.footprint import Echo, central_echo
 from sim.sensor.glare import GLARE, REACH_DEG, REPORTED_SHARE, STRAY_AT_1_DEG, _neighbours, add_glare
 from sim.sensor.lidar import Scan, _measure, scan
@@ -91,6 +93,40 @@ def test_stray_light_falls_with_the_square_of_the_angle_and_adds_up(sensor: Sens
     # no other beam changes
     np.testing.assert_array_equal(told.range_m[~is_outshone], clear.range_m[~is_outshone])
     np.testing.assert_array_equal(told.photons[~is_outshone], clear.photons[~is_outshone])
+
+
+def wall_plate() -> tuple[SensorMetadata, Scene]:
+    """A dense sensor before a plate of 2 m at 3 m, which some thousand beams meet."""
+    box, plate = box_mesh(HALF_M), box_mesh((0.01, 1.0, 0.5))
+    meshes = Mesh(box.vertices, box.faces[:, ::-1]), Mesh(plate.vertices + np.array((3.0, 0.0, 0.0)), plate.faces)
+    shares = np.array([0.25, RETRO], np.float32)
+    scene = Scene(meshes, Caster(meshes), np.array([0, 1], np.int32), shares, ("wall", "plate"), ("rock", "reflector"))
+    return load_profile("os1-128-nominal", "1024x10"), scene
+
+
+def test_the_memory_of_glare_does_not_grow_with_the_number_of_reflecting_beams() -> None:
+    sensor, scene = wall_plate()
+    clear, rays = bare_echo(sensor, scene), still(sensor)
+    assert (clear.geom == 1).sum() > 4000
+    draws = np.zeros(clear.range_m.shape, np.float32)
+    tracemalloc.start()
+    add_glare(clear, None, rays, sensor, scene.reflectivity >= RETRO_FROM, draws)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 40e6  # 2.5 million pairs of a source and a pixel
+
+
+def test_blocks_of_sources_give_the_bytes_of_all_at_once(
+    sensor: SensorMetadata, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = []
+    for n_pairs in (1, 3000, 1 << 40):
+        monkeypatch.setattr(glare, "_BLOCK_PAIRS", n_pairs)
+        told.append(glaring(sensor, hall(RETRO), 0.0)[1])
+    assert (told[0].geom == GLARE).sum() > 20
+    for other in told[1:]:
+        for name in ("range_m", "photons", "geom"):
+            np.testing.assert_array_equal(getattr(told[0], name), getattr(other, name))
 
 
 def test_most_outshone_beams_report_nothing_and_a_covered_plate_does_no_harm(sensor: SensorMetadata) -> None:

@@ -11,7 +11,7 @@ from scenarios.schema import Sensor
 from sim.geometry.mesh import Mesh, box_mesh
 from sim.geometry.raycast import Caster
 from sim.scene import Scene
-from sim.sensor.footprint import Echo, central_echo
+from sim.sensor.footprint import Echo, Limits, central_echo
 from sim.sensor.glass import ABSORBED, GLASS_INDEX, Panes, cross_glass
 from sim.sensor.lidar import scan
 from sim.sensor.optics import MIRRORED, mirrored_share, received_photons
@@ -102,3 +102,16 @@ def test_a_thing_behind_glass_is_itself_and_the_switch_makes_glass_a_wall(sensor
     both = scan(scene, sensor, quiet.model_copy(update={"returns": "dual"}), rays, 1, "after", 0, panes=panes_of(scene))
     n_second = (both.range_mm[sensor.height :] > 0).sum()
     assert n_second > 100
+
+
+def test_what_stands_behind_a_pane_beyond_the_greatest_range_hides_no_dust_on_it(sensor: SensorMetadata) -> None:
+    rays, walled, free, _ = look(sensor, hall())
+    panes = panes_of(hall())
+    told, rest = cross_glass(walled, rays, sensor.beam_origin_m, panes, Limits(0.3, 5.0))
+    is_lost = (walled.geom == 1) & (walled.range_m <= 5.0) & (free.geom == 0) & (free.range_m > 5.0)
+    assert is_lost.sum() > 100
+    for name in ("geom", "range_m", "photons"):
+        is_wall = is_lost & (told.geom == 1)
+        np.testing.assert_array_equal(getattr(told, name)[is_wall], getattr(walled, name)[is_wall])
+    assert ((told.range_m <= 5.0) & (told.geom != 0))[is_lost].all()
+    assert (rest.geom[is_lost] == 0).mean() > 0.9  # the stronger one is the second

@@ -17,7 +17,7 @@ from sim.geometry.mesh import Mesh, box_mesh
 from sim.geometry.raycast import Caster
 from sim.placement.puddles import Pool, lay_puddles
 from sim.scene import Scene, build_world
-from sim.sensor.footprint import Echo, central_echo
+from sim.sensor.footprint import Echo, Limits, central_echo
 from sim.sensor.lidar import scan
 from sim.sensor.optics import MIRRORED, mirrored_share, received_photons
 from sim.sensor.rays import Rays, revolution_rays
@@ -243,3 +243,15 @@ def test_the_view_shows_every_puddle_once_and_whose_it_is() -> None:
     for mesh in sheets.values():
         normals = np.cross(*(mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[:, 0]] for k in (1, 2)))
         assert (normals[:, 2] > 0).all()  # seen from above
+
+
+def test_a_ghost_beyond_the_greatest_range_hides_no_floor(sensor: SensorMetadata) -> None:
+    scene, (rays, dry, _) = room(), echoes(sensor, *lake())
+    crossed = dry, rays, sensor.beam_origin_m, Water(lake(), scene.caster, scene.reflectivity)
+    free, other = cross_water(*crossed)
+    told, rest = cross_water(*crossed, Limits(0.3, 11.0))
+    is_lost = (free.geom == MIRRORED) & (free.range_m > 11.0) & (other.range_m <= 11.0)
+    assert is_lost.sum() > 100
+    for name in ("geom", "range_m", "photons"):
+        np.testing.assert_array_equal(getattr(told, name), np.where(is_lost, getattr(other, name), getattr(free, name)))
+        np.testing.assert_array_equal(getattr(rest, name), np.where(is_lost, getattr(free, name), getattr(other, name)))
