@@ -10,6 +10,11 @@ from scenarios.catalogue import EFFECT_GROUPS
 
 Domain = Literal["in", "out"]
 TRAINED_FAMILIES = frozenset({"narrow", "wide", "network"})
+# Families with an effect of a mine that `train/mine` has, too.
+TRAINED_EFFECTS = frozenset(
+    {f"{effect}/{name}" for effect in ("cross", "dust", "water") for name in ("narrow", "null")}
+    | {"dust/mist", "dust/wide"}
+)
 TRAINED_KINDS = frozenset({"box", "crate", "chair", "barrel", "cone", "pallet", "rock", "vehicle", "muck_pile"})
 SURFACE_OUT = frozenset({"wide", "cave"})
 _NAMES = {"in": "in distribution", "out": "out of distribution", "all": "all pairs"}
@@ -19,11 +24,12 @@ _NAMES = {"in": "in distribution", "out": "out of distribution", "all": "all pai
 def domain_of(family: str) -> Domain:
     """Return "in" for the trained families and their shipped variations (`unchanged/wide`), "out" for all others.
 
-    Variations with dust, movers, two sensors or puddles (`dust/wide`) are out: no network or threshold has seen any.
-    Families `surface/*` are in but for `surface/wide` and `surface/cave`, on which nothing is tuned.
+    Variations with an effect of a mine are in where the network has seen it: dust, mist, puddles, two sensors that scan
+    (`cross/survey` is out). Those with movers or glare are out. Families `surface/*` are in but for `surface/wide` and
+    `surface/cave`, on which nothing is tuned.
     """
     group, _, name = family.rpartition("/")
-    is_trained = name in TRAINED_FAMILIES and group not in EFFECT_GROUPS
+    is_trained = family in TRAINED_EFFECTS or (name in TRAINED_FAMILIES and group not in EFFECT_GROUPS)
     if group == "surface":
         is_trained = name not in SURFACE_OUT
     return "in" if is_trained and (resources.files("scenarios") / "families" / f"{family}.yaml").is_file() else "out"

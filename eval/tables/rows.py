@@ -73,10 +73,14 @@ def is_told_the_truth(variant: str) -> bool:
 
 
 def with_domain(rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Return rows of results.csv as a table, with their `domain`."""
+    """Return rows of results.csv as a table, with their `domain`.
+
+    It is that with which they were scored: what networks had seen then.
+    """
     table = (rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(list(rows))).copy()  # in one block
-    family = texts(table, "family" if "family" in table else "scenario")
-    return table.assign(domain=[domain_of(name) for name in family])
+    family, stored = texts(table, "family" if "family" in table else "scenario"), texts(table, "domain")
+    named = zip(family, stored, strict=True)
+    return table.assign(domain=[told if told in DOMAINS[:2] else domain_of(name) for name, told in named])
 
 
 def is_answered(cases: pd.DataFrame) -> BoolArray:
