@@ -102,6 +102,23 @@ def test_one_jump_is_found_and_mended(tunnel: CloudScans) -> None:
     assert steps_off_m(found, tunnel.odom_T_sensor).max() < 0.05
 
 
+@pytest.mark.parametrize(("share", "is_kept"), [(0.5, True), (0.9, False)])
+def test_a_registration_that_loses_the_way_is_not_believed(
+    tunnel: CloudScans, monkeypatch: pytest.MonkeyPatch, share: float, is_kept: bool
+) -> None:
+    noisy = jittered(tunnel, 3)
+    shrunk = noisy.odom_T_sensor.copy()
+    shrunk[:, :3, 3] *= share  # as where rings on the ground match rings
+    monkeypatch.setattr(consistency, "_follow", lambda *_: shrunk)
+    monkeypatch.setattr(consistency, "_sweep_all", lambda _, poses, *__, **___: (poses, np.zeros(len(poses))))
+    expected = noisy.odom_T_sensor if is_kept else shrunk
+    np.testing.assert_array_equal(make_consistent(noisy).odom_T_sensor, expected)
+    standing = replaced(noisy, noisy.odom_T_sensor * 1.0)
+    standing.odom_T_sensor[:, :3, 3] = stream(4, "jitter").normal(0, 0.02, (len(shrunk), 3))
+    shrunk[:, :3, 3] = 0.0
+    np.testing.assert_array_equal(make_consistent(standing).odom_T_sensor, shrunk)  # its way is jitter
+
+
 def test_scans_of_one_stop_are_judged_together(monkeypatch: pytest.MonkeyPatch) -> None:
     path_m = np.concatenate([np.arange(0, 20, 0.5), np.full(3000, 20.0), np.arange(20.5, 40, 0.5)])
     off_share = stream(0, "bent").uniform(0, 0.03, len(path_m))
