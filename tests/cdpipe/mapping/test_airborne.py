@@ -202,7 +202,9 @@ def test_the_map_of_a_misty_session_holds_its_surfaces(pair: Path) -> None:
     assert n_off("drop") < 0.25 * n_off("keep")
 
 
-def test_what_looks_airborne_on_a_surface_comes_back_and_the_air_does_not(pair: Path) -> None:
+def test_what_looks_airborne_on_a_surface_comes_back_and_the_air_does_not(
+    pair: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     session = read_session(pair / "after")
     truth = np.concatenate([instance for instance, _ in read_labels(session.path, session.n_chunks)])
     config = MapConfig.model_validate({"airborne": "drop"})
@@ -217,12 +219,18 @@ def test_what_looks_airborne_on_a_surface_comes_back_and_the_air_does_not(pair: 
     n_lost -= (seen >= 0).sum()
     n_back = (left >= 0).sum() - (seen >= 0).sum()
     assert n_back > 0.5 * n_lost > 0
-    n_air = (truth == AIR).sum()
-    assert (left == AIR).sum() - (seen == AIR).sum() < 0.015 * n_air  # 1.0 %
+    n_air_back = (left == AIR).sum() - (seen == AIR).sum()
+    assert n_air_back < 0.011 * (truth == AIR).sum()  # 1.0 %
     # the second pass moves no other return
     assert set(
         zip(without.return_pixels.tolist(), without.scans_of(np.arange(len(seen))).tolist(), strict=True)
     ) <= set(zip(whole.return_pixels.tolist(), whole.scans_of(np.arange(len(left))).tolist(), strict=True))
+    # a reach of 0.2 m would take mist beside a wall for it
+    monkeypatch.setattr(airborne, "_SURFACE_M", 0.2)
+    loose = build_map(ClearScans(open_session(pair / "after")), config)
+    pixels = loose.scans_of(np.arange(len(loose.return_pixels))), loose.return_pixels
+    n_air_loose = (truth.reshape(len(truth), -1)[pixels] == AIR).sum() - (seen == AIR).sum()
+    assert n_air_back < 0.25 * n_air_loose
 
 
 class Sparse(RoomScans):
