@@ -15,8 +15,9 @@ from cdpipe.core.geometry.voxel import cell_keys
 
 # The ground at a place is the median over this many nearest columns, robust against a false return below the floor.
 _GROUND_COLUMNS = 5
-# Height from which an object has sides, and largest gap below one that stands.
-_SIDES_M, _FOOT_M = 0.2, 0.3
+# Height from which an object was seen with its sides, and largest gap below one that stands. A cut of the upper 0.24 m
+# of what stands on the floor (`paper-topn`, `paper/site1` 10010) is lower.
+_SIDES_M, _FOOT_M = 0.35, 0.3
 
 
 def upright_box(points: Float64Array) -> tuple[Float64Array, Float64Array]:

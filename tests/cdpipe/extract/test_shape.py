@@ -103,8 +103,10 @@ def test_what_hangs_in_the_air_or_on_a_wall_is_measured_down_to_itself() -> None
     wall = np.stack(np.meshgrid(np.linspace(-2, 2, 41), [0.31], np.linspace(0.3, 2.6, 24)), axis=-1).reshape(-1, 3)
     for other in (NOTHING, sheet(2.0), wall):
         assert column_volume_m3(hung, other) == pytest.approx(np.prod(size), rel=0.1)
-    # of a lid alone nobody knows how deep it reaches: to the floor
+    # of a lid, or the upper quarter of a metre, nobody knows how deep it reaches: to the floor
     assert column_volume_m3(sheet(0.5, 0.8), sheet(2.0)) == pytest.approx(0.9**2 * 0.8, rel=0.05)
+    top = box_faces((1.0, 0.6, 0.25), True) + np.array([0.0, 0.0, 0.55])
+    assert column_volume_m3(top, sheet(2.0)) == pytest.approx(0.6 * 0.8, rel=0.1)
 
 
 def test_what_was_loaded_away_is_measured_down_to_what_is_left() -> None:
