@@ -11,13 +11,9 @@ import numpy.typing as npt
 from cdpipe.core.geometry import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 from sim.geometry.bundles import Bundle
 from sim.geometry.raycast import RayCaster
-from sim.sensor.optics import RETRO_FROM, received_photons, reflected_share
+from sim.sensor.optics import DIVERGENCE_RAD, RETRO_FROM, WAIST_M, received_photons, reflected_share
 from sim.sensor.rays import Rays
 
-# Width of the beam at half its brightness: 9.5 mm where it leaves the window, growing by 0.18 deg (data sheet of the
-# first generation: 10 mm, 0.13 to 0.18 deg at half maximum; for the OS1-32 rev 6 both are unverified).
-WAIST_M = 0.0095
-DIVERGENCE_RAD = np.deg2rad(0.18)
 # Echoes nearer to one another than this blend into one. Ours, unverified: on the real revolution of `sim.sensor.optics`
 # 18 % of the edge pixels lie between surfaces 1 to 2 m apart, 6 % between those 2 to 8 m apart; nearer ones are
 # unmeasured.

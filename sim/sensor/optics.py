@@ -35,9 +35,13 @@ ANCHOR_90_M, ANCHOR_50_M = 45.0, 55.0
 SIGMA_FLOOR_M = 0.002
 SIGMA_PER_M = 0.0004
 SIGMA_ONE_PHOTON_M = 0.013
-# On a slanted surface what comes back is as long as the beam is wide across: its standard deviation as an angle, from
-# the divergence (see `sim.sensor.footprint`), and the steepest slant that is told apart.
-BEAM_SIGMA_RAD = 0.00133
+# Width of the beam at half its brightness: 9.5 mm where it leaves the window, growing by 0.18 deg (data sheet of the
+# first generation: 10 mm, 0.13 to 0.18 deg at half maximum; for the OS1-32 rev 6 both are unverified).
+WAIST_M = 0.0095
+DIVERGENCE_RAD = math.radians(0.18)
+# On a slanted surface what comes back is as long as the beam is wide across: standard deviations of a normal curve
+# for each width at half its height, and the steepest slant that is told apart.
+SIGMA_PER_WIDTH = 1.0 / math.sqrt(8.0 * math.log(2.0))
 LEAST_COSINE = 0.05
 # Above 100 % the reflectivity channel is logarithmic (the vendor's maintainers say so): counts for each doubling,
 # measured on about a hundred returns of 101 to 160; brighter ones bend off.
@@ -111,8 +115,9 @@ def apparent_reflectivity(photons: Float32Array, range_m: Float32Array) -> Float
 def range_sigma_m(range_m: Float32Array, photons: Float32Array, cosine: Float32Array) -> Float32Array:
     """Return the standard deviation of the range noise, metres.
 
-    Root of (2 mm)^2 + (0.4 mm per m)^2 + ((13 mm)^2 + (beam's width x R tan(incidence))^2) / photons: rises with
-    range and incidence, falls with the strength of the return; a return of less than one photon counts as one.
+    Root of (2 mm)^2 + (0.4 mm per m)^2 + ((13 mm)^2 + (width tan(incidence))^2) / photons, where the width of the beam
+    has the standard deviation 4.0 mm + 1.33 mm per m: rises with range and incidence, falls with the strength of the
+    return; a return of less than one photon counts as one.
 
     Args:
         range_m: Distance, metres, finite.
@@ -121,7 +126,8 @@ def range_sigma_m(range_m: Float32Array, photons: Float32Array, cosine: Float32A
     """
     squared_tangent = 1.0 / np.square(np.maximum(cosine, LEAST_COSINE)) - 1.0
     squared_range = np.square(range_m)
-    length = SIGMA_ONE_PHOTON_M**2 + BEAM_SIGMA_RAD**2 * squared_range * squared_tangent
+    width_m = np.float32(SIGMA_PER_WIDTH * WAIST_M) + np.float32(SIGMA_PER_WIDTH * DIVERGENCE_RAD) * range_m
+    length = SIGMA_ONE_PHOTON_M**2 + np.square(width_m) * squared_tangent
     variance = SIGMA_FLOOR_M**2 + SIGMA_PER_M**2 * squared_range + length / np.maximum(photons, 1.0)
     return np.asarray(np.sqrt(variance))
 

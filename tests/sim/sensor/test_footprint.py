@@ -10,10 +10,8 @@ from cdpipe.core.geometry import Float32Array, Float64Array, Int32Array
 from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 from sim.sensor.footprint import (
-    DIVERGENCE_RAD,
     EVERYWHERE,
     PULSE_M,
-    WAIST_M,
     Echo,
     Limits,
     beam_bundle,
@@ -23,7 +21,7 @@ from sim.sensor.footprint import (
     spread_echo,
     sub_ray_pattern,
 )
-from sim.sensor.optics import received_photons
+from sim.sensor.optics import DIVERGENCE_RAD, WAIST_M, received_photons
 from sim.sensor.rays import Rays
 
 N_FAN = 1201

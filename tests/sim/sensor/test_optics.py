@@ -76,10 +76,17 @@ def test_range_noise_by_hand() -> None:
     # 20 m, 25 photons: floor 2 mm, range 8 mm, photons 13/5 = 2.6 mm.
     sigma = range_sigma_m(floats(20.0), floats(25.0), floats(1.0))
     assert sigma[0] == pytest.approx(np.sqrt(0.002**2 + 0.008**2 + 0.0026**2), rel=1e-5)
-    # The same at 60 degrees: what comes back is 1.33 mrad x 20 m x tan 60 = 46.07 mm long, over 5 photons' root.
+    # The same at 60 degrees: half as bright, the beam is 9.5 mm + 20 m x tan 0.18 deg = 72.3 mm wide, which is 2.3548
+    # standard deviations of a normal curve; what comes back is 30.7 mm x tan 60 = 53.2 mm long, over 5 photons' root.
     slanted = range_sigma_m(floats(20.0), floats(25.0), floats(0.5))
-    length_m = 0.00133 * 20.0 * np.sqrt(3.0)
-    assert slanted[0] == pytest.approx(np.sqrt(sigma[0] ** 2 + (length_m / 5.0) ** 2), rel=1e-5)
+    assert slanted[0] == pytest.approx(np.sqrt(sigma[0] ** 2 + (0.0532 / 5.0) ** 2), rel=1e-3)
+
+
+def test_a_slant_counts_beside_the_sensor_where_the_beam_has_its_waist_alone() -> None:
+    facing = range_sigma_m(floats(0.1), floats(4.0), floats(1.0))
+    slanted = range_sigma_m(floats(0.1), floats(4.0), floats(0.5))
+    waist_m = 0.0095 / 2.3548 + 0.00133 * 0.1
+    assert slanted[0] == pytest.approx(np.hypot(facing[0], waist_m * np.sqrt(3.0) / 2.0), rel=1e-3)
 
 
 def test_range_noise_rises_with_range_and_incidence_and_falls_with_light() -> None:
