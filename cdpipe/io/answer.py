@@ -11,6 +11,7 @@
                   region_direction (R,) uint8, session of the queried keyframe, 0 before, 1 after (optional),
                   region_proposed_centres_map (R, 3), where regions were proposed that are now centred on their objects
                   (optional),
+                  region_is_forced (R,), regions that are looked at whatever the threshold (optional),
                   keyframe_scores (Kb,), before_keyframe_scans (Kb,), after_keyframe_scans (Ka,),
                   object_returns (M, 2) int32 with object_return_offsets (O + 1,),
                   object_points_map (P, 3) with object_point_offsets (O + 1,), and figure_<name> (R,) each;
@@ -125,6 +126,7 @@ def write_answer(folder: Path | str, method: str, report: ChangeReport, until: U
         "region_is_withdrawn": regions.is_withdrawn,
         "region_direction": regions.direction,
         "region_proposed_centres_map": regions.proposed_centres_map,
+        "region_is_forced": regions.is_forced,
         "local_before_T_after": report.local_before_T_after,
     }
     arrays |= {name: array for name, array in optional.items() if array is not None}
@@ -246,6 +248,7 @@ def _report(
         is_withdrawn=arrays.get("region_is_withdrawn"),
         direction=arrays.get("region_direction"),
         proposed_centres_map=arrays.get("region_proposed_centres_map"),
+        is_forced=arrays.get("region_is_forced"),
     )
     no_scans = np.zeros(0, dtype=np.int64)
     report = ChangeReport(

@@ -102,7 +102,7 @@ class AnswerPart(FailurePart):
 # Q points of the surface.
 _SHAPES: dict[str, tuple[str | int, ...]] = {
     "region_centres_map": ("R", 3), "region_scores": ("R",), "region_pairs": ("R", 2), "region_is_reported": ("R",),
-    "region_is_withdrawn": ("R",), "region_direction": ("R",), "keyframe_scores": ("Kb",),
+    "region_is_withdrawn": ("R",), "region_is_forced": ("R",), "region_direction": ("R",), "keyframe_scores": ("Kb",),
     "region_proposed_centres_map": ("R", 3), "region_radii_m": ("R",),
     "before_keyframe_scans": ("Kb",), "after_keyframe_scans": ("Ka",), "object_returns": ("M", 2),
     "object_return_offsets": ("O + 1",), "object_points_map": ("P", 3), "object_point_offsets": ("O + 1",),
@@ -118,7 +118,7 @@ OFFSETS = {
     "object_points_map": "object_point_offsets",
     "object_points_odom": "object_point_odom_offsets",
 }
-_MASKS = ("region_is_reported", "region_is_withdrawn")
+_MASKS = ("region_is_reported", "region_is_withdrawn", "region_is_forced")
 _FIGURE = "figure_"
 _MOST_TOLD = 100
 

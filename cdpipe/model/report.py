@@ -47,8 +47,8 @@ class ChangeRegions:
         radius_m: Radius of all spheres, metres; or (R,) float64 radius of each, where it follows the drift's width.
         scores: (R,) change score, falling; a larger score means a surer change.
         pairs: (R, 2) int64 before and after keyframe of each.
-        is_reported: (R,) whether the region is in the answer: it passed the threshold (or the fixed number of regions)
-            and was not withdrawn.
+        is_reported: (R,) whether the region is in the answer: it passed the threshold (or the fixed number of regions),
+            or is forced, and was not withdrawn.
         keyframe_scores: (K,) score of every before keyframe, NaN if the after session never came near.
         is_withdrawn: (R,) whether the region passed the threshold but contains no object, or none that a better region
             does not contain; None if none was withdrawn.
@@ -56,6 +56,7 @@ class ChangeRegions:
             centre is the position of that keyframe. None for methods that query no keyframes.
         proposed_centres_map: (R, 3) centres at which the regions were proposed, before the reported ones were centred
             on their objects; None if no region was centred.
+        is_forced: (R,) whether the region is looked at whatever the threshold; None if none is.
         clusters: What the source itself cut out, for `extract.method: clusters`; None of a source that finds places
             alone, and in an answer.
     """
@@ -69,6 +70,7 @@ class ChangeRegions:
     is_withdrawn: BoolArray | None = None
     direction: UInt8Array | None = None
     proposed_centres_map: Float64Array | None = None
+    is_forced: BoolArray | None = None
     clusters: Clusters | None = None
 
     @property
@@ -84,7 +86,7 @@ class ChangeRegions:
     def __post_init__(self) -> None:
         n = len(self.scores)
         require_shapes(self, centres_map=(n, 3), pairs=(n, 2), is_reported=(n,), is_withdrawn=(n,), direction=(n,))
-        require_shapes(self, proposed_centres_map=(n, 3))
+        require_shapes(self, proposed_centres_map=(n, 3), is_forced=(n,))
         if isinstance(self.radius_m, np.ndarray):
             require_shapes(self, radius_m=(n,))
         if self.is_reported.dtype != np.bool_:
@@ -294,6 +296,8 @@ class ChangeReport:
         columns = {"score": self.regions.scores, "is_withdrawn": ~self.regions.is_reported}
         columns |= {f"{axis}_m": self.regions.centres_map[:, k] for k, axis in enumerate(_AXES)} | dict(self.figures)
         columns["radius_m"] = self.regions.radii_m
+        if self.regions.is_forced is not None:
+            columns["is_forced"] = self.regions.is_forced
         return pd.DataFrame({"region": shown, **{name: values[shown] for name, values in columns.items()}})
 
 

@@ -60,19 +60,19 @@ def find_regions(
         places = _Places(merged, before, after, query)
     described = before if session == "before" else after
     radii_m = keyframe_radii(merged.map_of(session), described.keyframe_scans, query)
+    is_forced: BoolArray | None = None
     match config.regions.source:
         case "sphere":
             # a sphere descriptor covers 2 m of tunnel before and behind its keyframe
             scores = change_log_odds(merged, described, places.is_covered(session), config.sphere, session)
-            sure = scores.copy()
             if query.n_regions is None:
                 ends = _find_ends(places.of(session), places.of("after" if session == "before" else "before"), query)
-                scores[ends] = np.fmax(scores[ends], query.threshold)
+                is_forced = np.isin(np.arange(len(scores)), ends)
             keyframe_scores = _score_surroundings(
                 places,
                 session,
                 score_radii(merged.before, before.keyframe_scans, query),
-                lambda near, away_m: np.minimum(sure[near], _SURE) - _FALL_PER_M * away_m,
+                lambda near, away_m: np.minimum(scores[near], _SURE) - _FALL_PER_M * away_m,
             )
         case "sphere-difference":
             scores = sphere_difference(merged, before, after, query, session)
@@ -83,8 +83,9 @@ def find_regions(
         case other:
             raise ValueError(f"{other} is no source of regions at keyframes")
     direction = _from(BEFORE if session == "before" else AFTER, scores)
+    pairs, centres_map = places.pairs(session), places.of(session)
     return rank_regions(
-        places.of(session), scores, places.pairs(session), keyframe_scores, query, direction, radii_m=radii_m
+        centres_map, scores, pairs, keyframe_scores, query, direction, radii_m=radii_m, is_forced=is_forced
     )
 
 
@@ -92,7 +93,7 @@ def _find_ends(positions: Float64Array, others: Float64Array, config: QueryConfi
     """Return which of (K, 3) keyframes, their first or last, the other session with its (L, 3) came near.
 
     A sphere descriptor sees 2 m beyond such a keyframe, its region reaches farther, and no other keyframe does. So it
-    is always looked at.
+    is always looked at, whatever its score.
     """
     if not len(positions) or not len(others):
         return np.zeros(0, dtype=np.int64)
@@ -233,10 +234,12 @@ def rank_regions(
     direction: UInt8Array | None = None,
     *,
     radii_m: Float64Array,
+    is_forced: BoolArray | None = None,
 ) -> ChangeRegions:
     """Sort candidates by score, suppress those near a better one, and mark the reported ones.
 
-    Of two candidates of different radius, that of the better one decides what is near.
+    Of two candidates of different radius, that of the better one decides what is near. A candidate below the threshold
+    suppresses no forced one: it is not looked at itself.
 
     Args:
         centres_map: (N, 3) sphere centres, map frame, metres.
@@ -246,14 +249,16 @@ def rank_regions(
         config: Radius, suppression distance, and threshold or number of regions.
         direction: (N,) as in `ChangeRegions`; None if no keyframes are queried.
         radii_m: (N,) radius of each candidate.
+        is_forced: (N,) which candidates are reported whatever the threshold, unless a better reported one is near; None
+            for none. They keep their scores.
     """
+    is_looked_at = np.zeros(len(scores), np.bool_) if is_forced is None else is_forced
+    if config.n_regions is None:
+        is_looked_at = is_looked_at | (scores >= config.threshold)
     order = np.argsort(-scores, kind="stable")
     order = order[~np.isnan(scores[order])]
-    kept = order[_suppress_neighbours(centres_map[order], config.suppression * radii_m[order])]
-    if config.n_regions is None:
-        is_reported = scores[kept] >= config.threshold
-    else:
-        is_reported = np.arange(len(kept)) < config.n_regions
+    kept = order[_suppress_neighbours(centres_map[order], config.suppression * radii_m[order], is_looked_at[order])]
+    is_reported = is_looked_at[kept] if config.n_regions is None else np.arange(len(kept)) < config.n_regions
     return ChangeRegions(
         centres_map=centres_map[kept],
         radius_m=radii_m[kept] if config.radius_m == "width" else config.radius_m,
@@ -262,6 +267,7 @@ def rank_regions(
         is_reported=is_reported,
         keyframe_scores=keyframe_scores,
         direction=None if direction is None else direction[kept],
+        is_forced=None if is_forced is None else is_forced[kept],
     )
 
 
@@ -270,12 +276,16 @@ def _from(session: int, candidates: npt.NDArray[Any]) -> UInt8Array:
     return np.full(len(candidates), session, dtype=np.uint8)
 
 
-def _suppress_neighbours(centres: Float64Array, distances_m: Float64Array) -> BoolArray:
-    """Mark, from best to worst, every (N, 3) centre that is at least their distance, (N,), from all marked before."""
+def _suppress_neighbours(centres: Float64Array, distances_m: Float64Array, is_looked_at: BoolArray) -> BoolArray:
+    """Mark, from best to worst, every (N, 3) centre that is at least their distance, (N,), from all marked before.
+
+    One that is looked at, (N,), needs to be so far only from others that are.
+    """
     is_kept = np.ones(len(centres), dtype=np.bool_)
     for index, centre in enumerate(centres):
         if is_kept[index]:
-            is_kept[index + 1 :] &= np.linalg.norm(centres[index + 1 :] - centre, axis=1) >= distances_m[index]
+            is_apart = np.linalg.norm(centres[index + 1 :] - centre, axis=1) >= distances_m[index]
+            is_kept[index + 1 :] &= is_apart | (is_looked_at[index + 1 :] & ~is_looked_at[index])
     return is_kept
 
 

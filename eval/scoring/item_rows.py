@@ -65,6 +65,7 @@ def make_region_rows(report: ChangeReport | None, scored: RegionScores, truth: G
             "score": float(regions.scores[index]),
             "is_reported": bool(regions.is_reported[index]),
             "is_withdrawn": bool(is_withdrawn[index]),
+            "is_forced": regions.is_forced is not None and bool(regions.is_forced[index]),
             "outcome": scored.matches.outcomes[index],
             **dict(zip(("x_m", "y_m", "z_m"), map(float, regions.centres_map[index]), strict=True)),
             "radius_m": float(regions.radii_m[index]),

@@ -29,6 +29,7 @@ from eval.core.terminal.exits import run_program
 from eval.core.terminal.printing import echo
 from eval.plans.coverage import read_stored_plan
 from eval.running.runfolder import read_json
+from eval.tables.rows import forced, records
 
 ALARM_SHARE = 0.05
 FALSE_PER_100M = 0.1
@@ -69,7 +70,9 @@ def find_thresholds(results: pd.DataFrame, regions: pd.DataFrame, *, has_wide: b
     Where the radius belongs to a kind of site, so does the threshold: the same change scores differently in narrow and
     wide drifts. Kinds of site differ in `score_radius_m`, which is NaN for a preset that tells none apart: its
     threshold is of all pairs together. Withdrawn candidates cannot alarm. The run must therefore use a threshold below
-    the one sought; no lower one is returned.
+    the one sought; no lower one is returned. A forced region that was not withdrawn alarms at every threshold; where
+    there are too many, no threshold keeps the rate: it is NaN. A forced region that a better one covered in this run
+    counts as the better one.
 
     Args:
         results: Rows of results.csv.
@@ -97,11 +100,13 @@ def find_thresholds(results: pd.DataFrame, regions: pd.DataFrame, *, has_wide: b
             raise InputError(
                 f"{variant}, {_name_kind(radius_m)}: no pair has an answer: a threshold needs at least one"
             )
-        stands = (regions["variant"] == variant) & ~regions["is_withdrawn"].astype(bool)
-        lowest = _find_lowest_examined(regions[regions["variant"] == variant].merge(cases[["scenario", "seed"]]))
+        own = regions[regions["variant"] == variant]
+        lowest = _find_lowest_examined(own[~forced(own)].merge(cases[["scenario", "seed"]]))
+        standing = own[~own["is_withdrawn"].astype(bool)]
+        standing = standing.assign(score=standing["score"].mask(forced(standing), np.inf))
         if lowest is not None:
-            stands &= regions["score"] >= lowest
-        of_case = regions[stands].groupby(["scenario", "seed"])["score"]
+            standing = standing[standing["score"] >= lowest]
+        of_case = standing.groupby(["scenario", "seed"])["score"]
         found = {case: scores.to_numpy(dtype=np.float64) for case, scores in of_case}
         candidates = [found.get(case, np.zeros(0)) for case in zip(ok["scenario"], ok["seed"], strict=True)]
         best = np.array([scores.max(initial=-np.inf) for scores in candidates])
@@ -114,26 +119,34 @@ def find_thresholds(results: pd.DataFrame, regions: pd.DataFrame, *, has_wide: b
                 "score_radius_m": radius_m,
                 "threshold": threshold,
                 "n_pairs": len(ok),
-                "n_alarms": int((best >= threshold).sum()),
+                "n_alarms": int((best >= np.nan_to_num(threshold, nan=np.inf)).sum()),
                 "n_unanswered": len(cases) - len(ok),
                 "threshold_at_rate": at_rate,
                 "km": path_m / 1000.0,
-                "n_false": int((every >= at_rate).sum()),
+                "n_false": int((every >= np.nan_to_num(at_rate, nan=np.inf)).sum()),
             }
         )
     return pd.DataFrame(rows)
 
 
 def format_settings(table: pd.DataFrame) -> str:
-    """Return the thresholds in the YAML form of presets: by rate and variant, narrow or all sites, and `wide` ones."""
+    """Return the thresholds in the YAML form of presets: by rate and variant, narrow or all sites, and `wide` ones.
+
+    A comment stands where no threshold keeps the rate.
+    """
     lines = []
     rates = (
-        ("threshold", f"at most {ALARM_SHARE:.0%} of the unchanged pairs alarm"),
-        ("threshold_at_rate", f"at most {FALSE_PER_100M:g} false regions per 100 m"),
+        ("threshold", "{n_alarms} of {n_pairs} pairs alarm", f"at most {ALARM_SHARE:.0%} of the unchanged pairs alarm"),
+        ("threshold_at_rate", "{n_false} regions in {km:g} km", f"at most {FALSE_PER_100M:g} false regions per 100 m"),
     )
-    for column, meaning in rates:
+    for column, standing, meaning in rates:
         lines += [f"{column}:  # {meaning}"]
-        for variant, own in table.sort_values("score_radius_m", kind="stable").groupby("variant", sort=False):
+        for row in records(table[table[column].isna()]):
+            where = f"{row['variant']}, {_name_kind(row['score_radius_m'])}"
+            lines.append(f"  # {where}: none: {standing.format(**row)} at every threshold")
+        for variant, own in (
+            table[table[column].notna()].sort_values("score_radius_m", kind="stable").groupby("variant", sort=False)
+        ):
             first, *wider = zip(own["score_radius_m"], own[column], strict=True)
             lines += [f"  {variant}:", f"    preset: {{query: {{threshold: {first[1]:g}}}}}  # {_name_kind(first[0])}"]
             lines += [
@@ -212,12 +225,15 @@ def _find_lowest_examined(regions: pd.DataFrame) -> float | None:
 
 
 def _round_above(scores: Float64Array, allowed: int, lowest: float | None) -> float:
-    """Return the smallest number of four digits, `lowest` (0 if None) or more, that at most `allowed` scores reach."""
+    """Return the smallest number of four digits, `lowest` (0 if None) or more, that at most `allowed` scores reach.
+
+    NaN if more scores are infinite.
+    """
     silent_best = -np.inf if allowed >= len(scores) else np.sort(scores)[::-1][allowed]
     if lowest is not None:
         silent_best = max(silent_best, np.nextafter(lowest, -np.inf))
     if np.isinf(silent_best):
-        return 0.0
+        return 0.0 if silent_best < 0 else float("nan")
     digits = 4 - int(np.floor(np.log10(max(abs(float(silent_best)), 1e-12)))) - 1
     threshold = float(np.ceil(silent_best * 10.0**digits) / 10.0**digits)
     return threshold if threshold > silent_best else float(round(threshold + 10.0**-digits, digits))

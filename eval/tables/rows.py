@@ -37,6 +37,11 @@ def numbers(table: pd.DataFrame, column: str) -> Float64Array:
     return pd.to_numeric(table[column], errors="coerce").to_numpy(dtype=np.float64)
 
 
+def forced(regions: pd.DataFrame) -> BoolArray:
+    """Return (N,) which rows of regions.csv no threshold silences; none in tables of older runs, without the column."""
+    return np.asarray(regions["is_forced"].eq(True) if "is_forced" in regions else np.zeros(len(regions)), np.bool_)
+
+
 def tunnel_numbers(worlds: Iterable[str], seeds: Iterable[int]) -> Int64Array:
     """Return (N,) a number for the tunnel of each pair, in the order of their first pairs.
 

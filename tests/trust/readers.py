@@ -170,6 +170,7 @@ def _answer(folder: Path, *, by_returns: bool = False) -> None:
         region_scores=np.array([3.0, 2.0, 1.0]),
         region_is_reported=np.array([True, False, False]),
         region_is_withdrawn=np.array([False, True, False]),
+        region_is_forced=np.array([False, False, True]),
         **objects,
         before_keyframe_scans=np.arange(0, 14, 2),
         after_keyframe_scans=np.arange(0, 14, 2),

@@ -6,6 +6,7 @@ Below a method's own threshold nothing was looked at and nothing withdrawn: ther
 Scores of some methods mean something else in a wide drift than in a narrow one, as the radius does, so a threshold
 belongs to one method and one kind of site (`score_radius_m`): at each rate every kind of site has the best threshold
 of those that keep its own rate.
+A region that a method looks at whatever the threshold (`is_forced`), and does not withdraw, counts at every threshold.
 A pair with more than ten times the allowed false regions, and more than one, is lost: it misses all its changes and
 counts as so many. A pair without an answer is lost at every threshold, so no refusal raises a recall.
 """
@@ -23,7 +24,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from cdpipe.core.ranking import comparable, last_of_ties
 from eval.core.statistics import N_RESAMPLES, interval_of
-from eval.tables.rows import PAIR, tunnel_numbers
+from eval.tables.rows import PAIR, forced, tunnel_numbers
 
 RATES_PER_100M = (0.1, 0.5)
 _BATCH = 100
@@ -31,6 +32,8 @@ _BATCH = 100
 _FIRST_CANDIDATES = 256
 _MAX_ROC_POINTS = 400
 _ROUNDING = 1e-9
+# the score of what no threshold silences; thresholds that nothing reaches are infinite
+_ABOVE_ALL = np.finfo(np.float64).max
 # False regions of a lost pair, as a multiple of those allowed on its way; at least one.
 _LOST_AT = 10.0
 _DRAWN_RATES = (0.0, *(float(f"{rate:.2g}") for rate in np.geomspace(0.01, 100.0, 41)))
@@ -112,6 +115,8 @@ def ranked_pairs(
     }
     of_pair = np.array([place[str(a), int(b)] for a, b in regions[PAIR].itertuples(index=False, name=None)], np.int64)
     scores = regions["score"].to_numpy(dtype=np.float64)
+    if not is_proposal:
+        scores = np.where(forced(regions), _ABOVE_ALL, scores)
     n_new, is_false = np.zeros(len(scores), np.int64), np.zeros(len(scores), np.bool_)
     change_score = np.full(len(rows), -np.inf)
     change_rank = np.full(len(rows), len(scores), np.int64)

@@ -45,6 +45,20 @@ def _report() -> ChangeReport:
     )
 
 
+def test_regions_that_are_always_looked_at_survive_the_disk(tmp_path: Path) -> None:
+    plain = _report()
+    for is_forced in (None, np.array([False, True])):
+        report = replace(plain, regions=replace(plain.regions, is_forced=is_forced))
+        write_answer(tmp_path / "a", "ours", report)
+        answer = read_answer(tmp_path / "a")
+        assert answer.report is not None
+        np.testing.assert_array_equal(answer.report.regions.is_forced, is_forced)
+        table = report.to_pandas("regions")
+        assert ("is_forced" in table) == (is_forced is not None)
+        with np.load(tmp_path / "a" / "answer.npz") as arrays:
+            assert ("region_is_forced" in arrays) == (is_forced is not None)
+
+
 def test_an_answer_survives_the_disk(tmp_path: Path) -> None:
     write_answer(tmp_path / "a", "paper", _report())
     answer = read_answer(tmp_path / "a")

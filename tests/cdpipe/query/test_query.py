@@ -144,11 +144,14 @@ def test_a_session_without_keyframes() -> None:
             assert find(before, after, reading=reading) == {}
 
 
-def ranked(xs: list[float], scores: list[float], **settings: object) -> tuple[list[float], list[bool]]:
+def ranked(
+    xs: list[float], scores: list[float], forced: list[int] | None = None, **settings: object
+) -> tuple[list[float], list[bool]]:
     centres = np.array([[x, 0.0, 0.0] for x in xs]).reshape(-1, 3)
     pairs = np.zeros((len(xs), 2), np.int64)
     config, radii_m = QueryConfig(radius_m=4.0, **settings), np.full(len(xs), 4.0)
-    regions = rank_regions(centres, np.array(scores), pairs, np.zeros(0), config, radii_m=radii_m)
+    is_forced = None if forced is None else np.isin(np.arange(len(xs)), forced)
+    regions = rank_regions(centres, np.array(scores), pairs, np.zeros(0), config, radii_m=radii_m, is_forced=is_forced)
     return regions.centres_map[:, 0].tolist(), regions.is_reported.tolist()
 
 
@@ -177,6 +180,20 @@ def test_threshold_or_number() -> None:
     assert ranked(xs, scores, threshold=9.0, n_regions=1) == ([10, 30, 0], [True, False, False])
     assert ranked(xs, scores, n_regions=9)[1] == [True, True, True]
     assert ranked([], []) == ([], [])
+
+
+def test_what_is_always_looked_at_by_hand() -> None:
+    xs, scores, ends = [0.0, 10.0, 20.0, 30.0], [0.1, 0.4, 0.2, 0.3], [0, 3]
+    # they keep their scores, and stand behind all that is surer
+    assert ranked(xs, scores, ends, threshold=0.35) == ([10, 30, 20, 0], [True, True, False, True])
+    assert ranked(xs, scores, ends, threshold=9.0) == ([10, 30, 20, 0], [False, True, False, True])
+    assert ranked(xs, scores, ends, threshold=0.0) == ([10, 30, 20, 0], [True] * 4)
+    # 3 is nearer than a radius to the end at 0: it covers the end if it is looked at; else the end stays beside it
+    assert ranked([0, 3], [1, 2], [0], threshold=2.0) == ([3], [True])
+    assert ranked([0, 3], [1, 2], [0], threshold=2.1) == ([3, 0], [False, True])
+    # an end hides what is less sure, looked at or not, and of two ends that are near each other the surer one stays
+    assert ranked([0, 3], [2, 1], [0], threshold=9.0) == ([0], [True])
+    assert ranked([0, 3], [1, 2], [0, 1], threshold=9.0) == ([3], [True])
 
 
 def test_of_equal_scores_the_first_comes_first() -> None:
@@ -210,6 +227,21 @@ def test_scores_of_spheres_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     # but one has nothing surer than -1 within 4.5 m; the last was not visited again
     np.testing.assert_allclose(found.keyframe_scores, [2.8, 3.0, 2.8, 2.6, -1.0, np.nan])
     assert found.scores.max() == 8.0
+
+
+def test_ends_are_looked_at_with_their_own_scores(monkeypatch: pytest.MonkeyPatch) -> None:
+    way = session([(x, 0, 0) for x in (0.0, 10.0, 20.0, 30.0)], [[1, 0]] * 4)
+    monkeypatch.setattr("cdpipe.query.query.change_log_odds", lambda *_: np.array([-9.3, 5.0, -4.0, -7.1]))
+    merged = MergedMaps(way[0], way[0], make_pose(), {}, True)
+    for threshold, n_surer in ((-8.0, 2), (-3.0, 1), (9.0, 0), (1000.0, 0)):
+        found = find_regions(merged, way[1], way[1], by("sphere", radius_m=4.5, threshold=threshold))
+        assert found.scores.tolist() == [5.0, -4.0, -7.1, -9.3]
+        assert found.is_reported.tolist() == [n_surer > 0, n_surer > 1, True, True]
+        assert found.is_forced is not None and found.is_forced.tolist() == [False, False, True, True]
+    # a number of regions is the most that is reported
+    found = find_regions(merged, way[1], way[1], by("sphere", radius_m=4.5, n_regions=1))
+    assert found.is_reported.tolist() == [True, False, False, False]
+    assert found.is_forced is None
 
 
 def test_an_end_that_the_other_session_came_near_is_always_looked_at() -> None:

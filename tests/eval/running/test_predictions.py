@@ -285,6 +285,7 @@ def shifted(parts: dict[str, Any]) -> None:
         ),
         (False, lambda a: a.update(keyframe_scores=np.array([np.inf])), "keyframe_scores: "),
         (False, lambda a: a.update(region_is_withdrawn=np.zeros(2)), "region_is_withdrawn: "),
+        (False, lambda a: a.update(region_is_forced=np.zeros(2)), "region_is_forced: "),
         (False, lambda a: a.update(region_is_reported=np.ones(2, int)), "region_is_reported: "),
         (False, lambda a: a.update(before_keyframe_scans=np.array([3, 3])), "before_keyframe_scans "),
         (False, lambda a: a.update(region_centres_map=np.zeros(3)), "region_centres_map "),

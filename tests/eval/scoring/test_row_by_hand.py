@@ -277,7 +277,8 @@ def test_the_regions(case: CaseScore) -> None:
     for index, row in enumerate(case.regions):
         expected = {
             "region": index, "score": 7.0 - index, "is_reported": index in (1, 2, 3, 4),
-            "is_withdrawn": index in (0, 5), "outcome": outcomes[index], "x_m": x_m[index], "y_m": 0.5, "z_m": 0.5,
+            "is_withdrawn": index in (0, 5), "is_forced": False,
+            "outcome": outcomes[index], "x_m": x_m[index], "y_m": 0.5, "z_m": 0.5,
             "radius_m": 2.0,
             "found_changes": found[index], "found_changes_proposed": found[index], "v_sphere_m3": spheres[index],
             "v_oe_m3": NAN, "s_points": NAN, "oe_points": NAN, "asked_points": float(index),

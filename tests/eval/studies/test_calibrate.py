@@ -122,6 +122,31 @@ def test_no_threshold_is_below_what_was_looked_at() -> None:
     assert find_alarm_threshold(np.full(40, -8.0), lowest=-6.905) == -6.905
 
 
+def test_what_is_looked_at_at_every_threshold_is_silenced_by_none() -> None:
+    one_pair = _results(preset="tunnelcd")[:1]
+    results = pd.concat([one_pair] * 60, ignore_index=True).assign(seed=range(10_000, 10_060), status="ok")
+    rows = [("null/a", 10_000 + k, -9.0 + 0.1 * k, k >= 3, True) for k in range(60)]
+    rows.append(("null/a", 10_059, -2.0, False, False))
+    columns = ["scenario", "seed", "score", "is_withdrawn", "is_forced"]
+    regions = pd.DataFrame(rows, columns=columns).assign(variant="m", is_reported=lambda t: ~t["is_withdrawn"])
+    (one,) = find_thresholds(results, regions).to_dict("records")
+    # 60 pairs: three may alarm. The ends of three stand whatever the threshold, so no other pair may
+    assert (one["threshold"], one["n_alarms"]) == (pytest.approx(-1.999), 3)
+    assert (one["threshold_at_rate"], one["n_false"]) == (0.0, 3)  # 60 km allow sixty
+    # those of a fourth: no threshold silences it
+    regions.loc[3, ["is_withdrawn", "is_reported"]] = False, True
+    table = find_thresholds(results, regions)
+    (one,) = table.to_dict("records")
+    assert np.isnan(one["threshold"]) and one["n_alarms"] == 4
+    text = format_settings(table)
+    assert "  # m, all sites: none: 4 of 60 pairs alarm at every threshold\n" in text
+    assert list(yaml.safe_load(text)["threshold_at_rate"]) == ["m"]
+    # in a table of an earlier version the scores of ends were at least the threshold, and no column marks them
+    before = find_thresholds(results, regions.drop(columns="is_forced"))
+    pd.testing.assert_frame_equal(before, find_thresholds(results, regions.assign(is_forced=np.nan)))
+    assert before["threshold"].notna().all()
+
+
 def test_the_settings_are_lines_of_a_preset(tmp_path: Path) -> None:
     document = yaml.safe_load(format_settings(find_thresholds(_results(), _regions())))
     assert set(document) == {"threshold", "threshold_at_rate"}

@@ -100,6 +100,25 @@ def test_what_was_withdrawn_is_no_candidate_but_was_proposed() -> None:
     assert recall_at(ranked_pairs(results(), lost, changes(), is_proposal=True), 10.0) == 3 / 4
 
 
+def test_what_is_looked_at_whatever_the_threshold_counts_at_every_one() -> None:
+    # narrow: the refused pair counts as 1, and the false region at 8 stands always: 2 in 3.1 km are 0.065 per 100 m
+    found = regions()
+    of_false = found.assign(is_forced=found["score"] == 8.0)
+    assert [recall_at(ranked_pairs(results(), of_false, changes()), rate) for rate in (0.032, 0.064)] == [0.0, 0.0]
+    assert recall_at(ranked_pairs(results(), of_false, changes()), 0.065) == 1 / 4
+    assert not found_at(ranked_pairs(results(), of_false, changes()), 0.064).any()
+    # what was withdrawn does not stand; of proposals the scores count, and older tables have no such column
+    gone = of_false.assign(is_withdrawn=found["score"] == 8.0)
+    for each in (gone, gone.drop(columns="is_forced"), gone.assign(is_forced=np.nan)):
+        np.testing.assert_array_equal(free_response(ranked_pairs(results(), each, changes()))[0][2], 0.079)
+    for each in (of_false, found):
+        assert recall_at(ranked_pairs(results(), each, changes(), is_proposal=True), 0.034) == 1 / 4
+    # the one at 7 finds both changes of pair 1, and stands always: they cost nothing
+    of_true = found.assign(is_forced=found["score"] == 7.0)
+    assert recall_at(ranked_pairs(results(), of_true, changes()), 0.033) == 2 / 4
+    assert found_at(ranked_pairs(results(), of_true, changes()), 0.033).tolist() == [True, True, False, False]
+
+
 def test_proposals_count_where_they_were_proposed() -> None:
     # the candidate at 9 was proposed beside the change 1, on nothing; the one at 7 finds it then
     found = regions()
