@@ -158,7 +158,8 @@ def format_settings(table: pd.DataFrame) -> str:
 
 def format_plan(table: pd.DataFrame) -> str:
     """Return the thresholds of variants with settings as a plan has them: at most 5 % of the unchanged pairs alarm."""
-    own = table[table["variant"].str.contains("[", regex=False) & table["score_radius_m"].isna()]
+    is_settings = table["variant"].str.contains("[", regex=False)
+    own = table[is_settings & table["score_radius_m"].isna() & table["threshold"].notna()]
     if len(own) == 0:
         return ""
     lines = [f'  "{name}": {value:g}' for name, value in zip(own["variant"], own["threshold"], strict=True)]
