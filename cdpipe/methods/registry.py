@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from cdpipe.core.errors import InputError
@@ -105,8 +106,9 @@ def list_extras(
     return {**found, **{package: extra_version(package) for package in packages}}
 
 
+@cache
 def load_method(name: str) -> Method:
-    """Return what is registered under a name.
+    """Return what is registered under a name; a class is created at the first call.
 
     Raises:
         InputError: No method has this name, it cannot be imported, its extra is not installed, or it is of none of the

@@ -230,6 +230,20 @@ def test_every_preset_has_its_source() -> None:
     assert load_method("c2c").propose == c2c.propose
 
 
+def test_a_class_is_created_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+
+    class Kept:
+        def __init__(self) -> None:
+            made.append(self)
+
+        def propose(self) -> None: ...
+
+    monkeypatch.setattr("cdpipe.methods.registry.load_entry_point", lambda *_: Kept)
+    assert load_method("kept for a test") is load_method("kept for a test")
+    assert len(made) == 1
+
+
 def test_an_answer_names_the_optional_packages_that_it_depends_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cdpipe.methods.registry.extra_version", lambda name: f"{name} 1")
     ours, m3c2 = load_config("tunnelcd"), load_config("m3c2")
