@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from cdpipe.core.errors import InputWarning, MergeFailedError
+from cdpipe.core.errors import InputError, InputWarning, MergeFailedError
 from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors.describe import list_checkpoints, load_descriptors, use_threads
@@ -35,6 +35,7 @@ from cdpipe.query.drift_width import keyframe_radii
 from cdpipe.surface.measure import measure_surface, require_method
 from cdpipe.surface.rock_or_object import leave_out_rock
 
+_Answer = TypeVar("_Answer", ChangeRegions, ChangeReport)
 Merge = Callable[[MappedSession, MappedSession], MergedMaps]
 Propose = Callable[[tuple[Int64Array, Int64Array], Float64Array], ChangeRegions]
 
@@ -114,8 +115,8 @@ def detect_changes(
 
     Raises:
         MergeFailedError: The sessions could not be aligned with enough evidence; it contains the evidence.
-        InputError: The source of regions cannot be loaded, or does not go with the extraction; or the extra of
-            `surface.method` is not installed.
+        InputError: The source of regions cannot be loaded, does not go with the extraction, or returned another type
+            than it should; or the extra of `surface.method` is not installed.
     """
     hooks = hooks or Hooks()
     method = load_source(config)
@@ -128,7 +129,7 @@ def detect_changes(
         assert method.propose is not None
         hooks.on_stage("query", 0, 1)
         start = time.perf_counter()
-        proposed = method.propose(merged, *described, config)
+        proposed = _require(ChangeRegions, method.propose(merged, *described, config), config)
         return Done(proposed, {"t_cd_s": time.perf_counter() - start})
 
     def answer() -> Done[ChangeReport]:
@@ -136,7 +137,7 @@ def detect_changes(
             report = extract_changes(merged, regions.value, described, regions.seconds["t_cd_s"], config)
         else:
             assert method.detect is not None  # a method has `propose` or `detect`
-            report = method.detect(merged, *described, config)
+            report = _require(ChangeReport, method.detect(merged, *described, config), config)
         if config.surface.method != "none":
             hooks.on_stage("surface", 0, 1)
             surface, is_rock, seconds = measure_surface(merged, report.objects, config)
@@ -210,6 +211,14 @@ def merge_mapped(
         merged.evidence,
         {name: merged.seconds[name] for name in ("t_index_s", "t_merge_s") if name in merged.seconds},
     )
+
+
+def _require(kind: type[_Answer], found: Any, config: PipelineConfig) -> _Answer:
+    """Return what a source of regions returned; one of a plugin may return anything."""
+    if not isinstance(found, kind):
+        text = f"regions.source = {config.regions.source} returned {type(found).__name__}: expected {kind.__name__}"
+        raise InputError(text)
+    return found
 
 
 def _warn_of_few_views(mapped: Sequence[MappedSession], config: PipelineConfig) -> None:

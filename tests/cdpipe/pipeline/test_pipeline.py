@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.errors import InputWarning, MergeFailedError
+from cdpipe.core.errors import InputError, InputWarning, MergeFailedError
 from cdpipe.core.geometry import Float64Array, stream, yaw_pose
 from cdpipe.io.answer import read_answer, write_answer
 from cdpipe.io.readers import open_session
+from cdpipe.methods.registry import Method
 from cdpipe.model.config import ClusterConfig, ExtractConfig, MergeConfig, OutlierConfig, PipelineConfig, QueryConfig
 from cdpipe.model.report import ChangeReport, SurfaceField
 from cdpipe.model.types import MappedSession
@@ -61,6 +62,18 @@ def test_the_report_names_its_settings_and_times(report: ChangeReport, tunnel_af
         assert item.returns[:, 0].max() < len(tunnel_after.map.odom_T_sensor)
         assert len(item.returns) >= len(item.points_map)
         assert len({tuple(row) for row in item.returns.tolist()}) == len(item.returns)
+
+
+def test_a_source_that_returns_something_else_is_named(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for kind, method in (
+        ("ChangeReport", Method(lambda *_: None, None, uses_descriptors=False, has_clusters=False)),
+        ("ChangeRegions", Method(None, lambda *_: None, uses_descriptors=False, has_clusters=False)),
+    ):
+        monkeypatch.setattr("cdpipe.pipeline.detection.load_source", lambda _, method=method: method)
+        with pytest.raises(InputError, match=f"^regions.source = scan returned NoneType: expected {kind}$"):
+            detect_changes(tunnel_before, tunnel_after, CONFIG)
 
 
 def test_the_report_survives_the_disk(report: ChangeReport, tmp_path: Path) -> None:
