@@ -101,7 +101,7 @@ def test_checkpoints_are_those_that_a_method_uses(tmp_path: Path) -> None:
     found = list_checkpoints(PipelineConfig(regions=RegionsConfig(source="range-net"), range_net=rival))
     assert found["range-net"] == digest(numbered_checkpoint_bytes(network)) and "sphere" not in found
     # the paper compares scans; a hand-made descriptor has no file
-    assert list(list_checkpoints(PipelineConfig(sphere=mine))) == ["3deg"]
+    assert list(list_checkpoints(PipelineConfig().model_copy(update={"sphere": mine}))) == ["3deg"]
     by_hand = PipelineConfig(descriptor=DescriptorConfig(method="solid"))
     assert list_checkpoints(by_hand)["solid"].startswith("version")
     with pytest.raises(ValidationError, match=r"descriptor\.method = solid has no weights of its own: expected 3deg"):
