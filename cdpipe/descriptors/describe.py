@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, lru_cache
@@ -13,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from cdpipe.core.errors import InputError
+from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.files import ArraySpec, read_npz
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array
 from cdpipe.core.geometry.path_frames import FRAMES
@@ -105,7 +106,7 @@ def save_descriptors(
     map_config: MapConfig,
     sphere: SphereConfig = _SHIPPED,
 ) -> Path:
-    """Write descriptors to `folder/descriptors/<name>.npz` and return the file.
+    """Write descriptors to `folder/descriptors/<name>.npz` and return the file; warn if it held others.
 
     The file also holds what they are valid for: the (S, 4, 4) poses of the session and, with sphere descriptors, the
     digest of the weights and the map settings.
@@ -120,26 +121,42 @@ def save_descriptors(
         optional |= {"spheres": descriptors.spheres, "spheres_of": np.array(_spheres_of(map_config, sphere))}
     if map_config.airborne != "keep":
         optional["airborne"] = np.array(map_config.airborne)
+    arrays = {
+        "checkpoint": np.array(descriptors.checkpoint),
+        "q": descriptors.q,
+        "keyframe_scans": descriptors.keyframe_scans,
+        "odom_T_sensor": odom_T_sensor,
+        **optional,
+    }
+    _warn_of_others(path, arrays)
     try:
         if path.parent.is_symlink():
             raise InputError(f"{path.parent}: is a link, and nothing outside of {folder} may be written: remove it")
         path.parent.mkdir(exist_ok=True, parents=True)
         partial.unlink(missing_ok=True)  # it may be a link, which a writer would follow
-        np.savez(
-            partial,
-            allow_pickle=False,
-            checkpoint=np.array(descriptors.checkpoint),
-            q=descriptors.q,
-            keyframe_scans=descriptors.keyframe_scans,
-            odom_T_sensor=odom_T_sensor,
-            **optional,
-        )
+        np.savez(partial, allow_pickle=False, **arrays)
         partial.replace(path)
     except OSError as error:
         with suppress(OSError):  # a closed folder does not even let look
             partial.unlink()
         raise InputError(f"{path}: cannot write there: {error.strerror}") from error
     return path
+
+
+def _warn_of_others(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Warn if a file holds descriptors of the same poses that other settings can use and these cannot replace."""
+    try:
+        stored = read_npz(path, _FILE, remedy="") if path.is_file() else {}
+    except InputError:
+        return
+    if not stored or not np.array_equal(stored["odom_T_sensor"], arrays["odom_T_sensor"]):
+        return
+    of_scans = [np.array_equal(stored[name], arrays[name]) for name in ("checkpoint", "keyframe_scans")]
+    of_air = [str(each.get("airborne", "keep")) for each in (stored, arrays)]
+    is_same_spheres = "spheres_of" not in stored or str(stored["spheres_of"]) == str(arrays.get("spheres_of"))
+    if not (all(of_scans) and of_air[0] == of_air[1] and is_same_spheres):
+        text = f"{path}: replaces the descriptors of other settings: with those, the session is described anew"
+        warnings.warn(text, InputWarning, stacklevel=3)
 
 
 def load_descriptors(

@@ -1,5 +1,6 @@
 import errno
 import os
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from cdpipe.descriptors.describe import _BATCH, insert_rows
 from cdpipe.descriptors.network import DIMENSIONS, make_untrained_network, yaw_correlation
 from cdpipe.descriptors.range_image import COLUMNS, ELEVATION_RAD, ROWS, range_image
 from cdpipe.model.config import DescriptorConfig, MapConfig
-from cdpipe.model.types import PosedScan, Spheres
+from cdpipe.model.types import DescriptorSet, PosedScan, Spheres
 from cdpipe.training.fit import FitConfig, fit
 from cdpipe.training.scan_training import PlaceData, PlaceTask, _mirror, _partners, _place_loss, evaluate
 
@@ -77,6 +78,33 @@ def test_descriptors_are_unit_vectors_and_survive_the_disk(tmp_path: Path, metho
     np.savez(path, q=made.q)
     with pytest.raises(InputError, match=r"damaged"):
         load_descriptors(tmp_path, config, poses, MapConfig())
+
+
+def test_descriptors_of_other_settings_are_replaced_with_a_warning(tmp_path: Path) -> None:
+    poses, plain, dust = _Source.odom_T_sensor, MapConfig(), MapConfig(airborne="drop")
+    made = describe_scans(_Source(), np.array([0, 2]), DescriptorConfig())
+    with_spheres = replace(made, spheres=np.zeros((2, 64), np.float32))
+
+    def save(descriptors: DescriptorSet, map_config: MapConfig, *, warns: bool) -> None:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            path = save_descriptors(tmp_path, descriptors, poses, map_config)
+        assert [str(each.message) for each in told] == warns * [
+            f"{path}: replaces the descriptors of other settings: with those, the session is described anew"
+        ]
+
+    save(made, plain, warns=False)
+    save(made, plain, warns=False)
+    save(with_spheres, plain, warns=False)  # they serve the settings of before, too
+    save(made, plain, warns=True)
+    save(with_spheres, dust, warns=True)
+    save(with_spheres, MapConfig(airborne="drop", voxel_m=0.1), warns=True)
+    save(replace(made, checkpoint="other"), dust, warns=True)
+    save(replace(made, keyframe_scans=np.array([0, 1])), dust, warns=True)
+    (tmp_path / "descriptors" / "3deg.npz").write_bytes(b"")
+    save(made, plain, warns=False)
+    poses = poses + 1e-9
+    save(with_spheres, dust, warns=False)  # what was recorded anew is described anew anyway
 
 
 def test_descriptors_that_do_not_fit_on_the_disk_leave_no_part_of_them(
