@@ -70,7 +70,8 @@ def test_plugins_run_in_a_plan_and_are_scored(installed: dict[str, str]) -> None
     assert done.returncode == 0, done.stderr
     rows = pd.read_csv(out / "results.csv").set_index("variant")
     assert (rows["status"] == "ok").all()
-    assert rows.loc["higher", "n_objects"] > 0
+    # the box that came, and neither walls nor roof
+    assert (rows.loc["higher", "n_objects"], rows.loc["higher", "object_f1_25"]) == (1, 1)
     assert rows.loc["higher", "largest_object_returns"] > 0
     # its own setting reaches it: nothing stands 100 m higher
     assert rows.loc["higher[options.step_m=100]", "n_objects"] == 0
