@@ -31,6 +31,7 @@ from cdpipe.descriptors.range_image import range_image
 from cdpipe.descriptors.sphere import sphere_digest
 from cdpipe.descriptors.weights_file import checkpoint_bytes, digest, read_weights
 from cdpipe.model.config import DescriptorConfig, MapConfig, PipelineConfig, SphereConfig
+from cdpipe.model.config.comparison import SOURCES_AT_KEYFRAMES, WHOLE_MAP_SOURCES
 from cdpipe.model.types import DescriptorSet, PosedScan, ScanSource
 
 # Scans described at a time; the features of more do not fit the cache. The results are those of batches of twice as
@@ -216,6 +217,25 @@ def list_checkpoints(config: PipelineConfig) -> dict[str, str]:
         case "range-net":
             found["range-net"] = range_net_digest(config.range_net)
     return found
+
+
+def require_weights_are_read(config: PipelineConfig) -> None:
+    """Refuse a file of weights that the source of regions does not read; a plugin's source may read any.
+
+    Plans do not ask this: one `--set` is for all of their variants.
+
+    Raises:
+        InputError: `sphere.weights` or `range_net.weights` is set beside another source.
+    """
+    source = config.regions.source
+    if source not in (*SOURCES_AT_KEYFRAMES, *WHOLE_MAP_SOURCES):
+        return
+    sections = (("sphere", "sphere", config.sphere.weights), ("range_net", "range-net", config.range_net.weights))
+    for section, reader, weights in sections:
+        if weights and source != reader:
+            raise InputError(
+                f"{section}.weights = {weights}: regions.source = {source} does not read them: expected {reader}"
+            )
 
 
 def use_threads(n_threads: int) -> None:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from cdpipe.core.errors import InputError, InputWarning, MergeFailedError
 from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.core.threads import THREADS
-from cdpipe.descriptors.describe import list_checkpoints, load_descriptors, use_threads
+from cdpipe.descriptors.describe import list_checkpoints, load_descriptors, require_weights_are_read, use_threads
 from cdpipe.extract.extract import extract_changes, make_report
 from cdpipe.io.known_merge import require_rigid
 from cdpipe.mapping.free_space import views_of_one
@@ -75,6 +75,7 @@ def detect(
     # report a missing extra, or bad weights, before the mapping
     load_source(config)
     require_method(config.surface.method)
+    require_weights_are_read(config)
     list_checkpoints(config)
     use_threads(THREADS)
     hooks = hooks or Hooks()

@@ -13,7 +13,14 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.threads import THREADS
-from cdpipe.descriptors.describe import describe_scans, insert_rows, list_checkpoints, save_descriptors, use_threads
+from cdpipe.descriptors.describe import (
+    describe_scans,
+    insert_rows,
+    list_checkpoints,
+    require_weights_are_read,
+    save_descriptors,
+    use_threads,
+)
 from cdpipe.descriptors.sphere import anchor_frames, describe_map
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.airborne import clear_air
@@ -38,6 +45,7 @@ def describe(
         InputError: The session or a setting cannot be used, or the session's folder cannot be written.
     """
     config = load_config(preset, settings)
+    require_weights_are_read(config)
     list_checkpoints(config)  # report bad weights before the mapping
     use_threads(THREADS)
     source, folder = open_with_folder(session)

@@ -91,19 +91,6 @@ class PipelineConfig(Settings):
             )
         return self
 
-    @model_validator(mode="after")
-    def _uses_weights(self) -> PipelineConfig:
-        source = self.regions.source
-        if source not in (*SOURCES_AT_KEYFRAMES, *WHOLE_MAP_SOURCES):
-            return self  # a plugin's source may read them
-        for owner, weights in (("sphere", self.sphere.weights), ("range-net", self.range_net.weights)):
-            if weights and source != owner:
-                section = owner.replace("-", "_")
-                raise ValueError(
-                    f"{section}.weights = {weights}: regions.source = {source} does not read them: expected {owner}"
-                )
-        return self
-
     @model_serializer(mode="wrap")
     def _without_empty_groups(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         own, fields = self.regions.source.replace("-", "_"), type(self).model_fields

@@ -23,11 +23,13 @@ from cdpipe.descriptors import (
     sphere_digest,
 )
 from cdpipe.descriptors.change_network import make_untrained_change_network
+from cdpipe.descriptors.describe import require_weights_are_read
 from cdpipe.descriptors.network import make_untrained_network
 from cdpipe.descriptors.sphere_network import SphereSize, make_untrained_sphere_network
 from cdpipe.descriptors.weights_file import digest, numbered_checkpoint_bytes
 from cdpipe.model.config import DescriptorConfig, PipelineConfig, RangeNetConfig, RegionsConfig, SphereConfig
 from cdpipe.model.types import PointMap, PosedScan
+from cdpipe.pipeline import describe, detect
 
 Digest = Callable[[str], str]
 
@@ -101,7 +103,17 @@ def test_checkpoints_are_those_that_a_method_uses(tmp_path: Path) -> None:
     found = list_checkpoints(PipelineConfig(regions=RegionsConfig(source="range-net"), range_net=rival))
     assert found["range-net"] == digest(numbered_checkpoint_bytes(network)) and "sphere" not in found
     # the paper compares scans; a hand-made descriptor has no file
-    assert list(list_checkpoints(PipelineConfig().model_copy(update={"sphere": mine}))) == ["3deg"]
+    assert list(list_checkpoints(PipelineConfig(sphere=mine))) == ["3deg"]
+    with pytest.raises(
+        InputError, match=r"^sphere\.weights = .*: regions\.source = scan does not read them: expected sphere"
+    ):
+        detect("before", "after", "paper", {"sphere.weights": mine.weights})
+    with pytest.raises(
+        InputError, match=r"^range_net\.weights = a: .* = sphere does not read them: expected range-net$"
+    ):
+        describe("before", settings={"range_net.weights": "a"})
+    # a plugin's source may
+    require_weights_are_read(PipelineConfig(regions=RegionsConfig.model_construct(source="own"), sphere=mine))
     by_hand = PipelineConfig(descriptor=DescriptorConfig(method="solid"))
     assert list_checkpoints(by_hand)["solid"].startswith("version")
     with pytest.raises(ValidationError, match=r"descriptor\.method = solid has no weights of its own: expected 3deg"):

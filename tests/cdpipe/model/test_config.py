@@ -149,7 +149,6 @@ def test_weights_of_a_preset_start_at_its_file_and_those_of_a_setting_at_the_wor
     preset.write_text(
         "descriptor: &both {weights: a/3deg.safetensors}\n"
         "sphere: {weights: /b.safetensors}\n"
-        "regions: {source: sphere}\n"
         "wide: {descriptor: *both}\n"
     )
     for site in ("narrow", "wide"):
@@ -160,24 +159,9 @@ def test_weights_of_a_preset_start_at_its_file_and_those_of_a_setting_at_the_wor
     assert (config.descriptor.weights, config.sphere.weights) == ("c.safetensors", "")
 
 
-def test_weights_that_the_source_does_not_read_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    for preset, setting, message in (
-        ("paper", "sphere.weights=a", "sphere.weights = a: regions.source = scan does not read them: expected sphere"),
-        ("c2c", "sphere.weights=a", "sphere.weights = a: regions.source = c2c does not read them: expected sphere"),
-        ("tunnelcd", "range_net.weights=a", "range_net.weights = a: regions.source = sphere does not read them: exp"),
-    ):
-        with pytest.raises(InputError, match=message):
-            load_config(preset, [setting])
-    assert load_config("range-net", ["range_net.weights=a"]).range_net.weights == "a"
-    # a plugin's source may ask for the change around its places, too
-    monkeypatch.setattr("cdpipe.model.config.comparison.entry_points", lambda _: {"mine": None, "scan": None})
-    mine = PipelineConfig.model_validate({"regions": {"source": "mine"}, "sphere": {"weights": "a"}})
-    assert mine.sphere.weights == "a"
-
-
 def test_a_preset_on_the_search_path_has_its_weights_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "presets").mkdir()
-    (tmp_path / "presets" / "mine.yaml").write_text("sphere: {weights: w.safetensors}\nregions: {source: sphere}\n")
+    (tmp_path / "presets" / "mine.yaml").write_text("sphere: {weights: w.safetensors}\n")
     monkeypatch.setenv("TUNNELCD_PATH", str(tmp_path))
     assert load_config("mine").sphere.weights == str(tmp_path / "presets" / "w.safetensors")
 
