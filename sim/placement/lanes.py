@@ -9,16 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from scenarios.schema import Scenario, SessionPlan
 from sim.geometry.raycast import Caster
 from sim.placement.placing import Standing, free_width, standing_corners, standing_height_m
 from sim.placement.recorded import read_drive
 from sim.rock.centreline import Centreline, headings_of, left_of, resample
 
-_STEP_M = 0.25
+LANE_STEP_M = 0.25
 # Spare width that props must leave beyond the need of the platform.
-_SPARE_M = 0.15
+SPARE_M = 0.15
 # The line changes sides over this distance, so props count this far before and behind where they stand.
 _SWERVE_M = 1.5
 # A quadrotor keeps this vertical distance to what it flies over.
@@ -61,21 +61,19 @@ class Lane:
         return span
 
     def is_open(self, taken: Sequence[Float64Array]) -> bool:
-        """Tell whether every station has a gap between the sides of the drift and the blocked offsets (N, 2)."""
-        if not taken:
-            return True
-        spans = np.stack(taken, axis=1)
-        for row in np.flatnonzero(np.isfinite(spans[:, -1, 0])):
-            # The last prop is the new one; it can have closed the lane only where it blocks something.
-            bars = spans[row][np.isfinite(spans[row, :, 0])]
-            bars = bars[np.argsort(bars[:, 0])]
-            edge, widest = self.low_m[row], -np.inf
-            for low, high in bars:
-                widest = max(widest, min(low, self.high_m[row]) - edge)
-                edge = max(edge, high)
-            if max(widest, self.high_m[row] - edge) < _SPARE_M:
-                return False
-        return True
+        """Tell whether the offsets (N, 2) that the last prop blocks beside all others leave a gap everywhere."""
+        # The last prop is the new one; it can have closed the lane only where it blocks something.
+        return not taken or bool((self.gaps_m(taken, np.isfinite(taken[-1][:, 0])) >= SPARE_M).all())
+
+    def gaps_m(self, taken: Sequence[Float64Array], rows: BoolArray) -> Float64Array:
+        """Return the widest gap (R,) between the sides of the drift and blocked offsets (N, 2) at some rows (N,)."""
+        low, high = np.stack([each[rows] for each in taken], axis=2).transpose(1, 0, 2)
+        low, high = np.where(np.isnan(low), np.inf, low), np.where(np.isnan(high), -np.inf, high)
+        order = np.argsort(low, axis=1)
+        ends = np.minimum(np.take_along_axis(low, order, 1), self.high_m[rows, None])
+        edges = np.maximum(np.take_along_axis(high, order, 1), self.low_m[rows, None])
+        edges = np.column_stack([self.low_m[rows], np.maximum.accumulate(edges, axis=1)])
+        return np.asarray((np.column_stack([ends, self.high_m[rows]]) - edges).max(axis=1))
 
 
 def build_lanes(
@@ -104,8 +102,8 @@ def build_lanes(
 
 def _recorded_lane(scenario: Scenario, session: str, trajectory: Path) -> Lane:
     """Return the lane of a recorded trajectory, which avoids no obstacle and may have any height."""
-    line = resample(read_drive(trajectory)[0].points[:, :2], _STEP_M)
-    room_m = np.full(len(line), _SPARE_M / 2)
+    line = resample(read_drive(trajectory)[0].points[:, :2], LANE_STEP_M)
+    room_m = np.full(len(line), SPARE_M / 2)
     return Lane(session, line, headings_of(line), -room_m, room_m, scenario.platform.clearance_m, 0.0)
 
 
@@ -174,10 +172,10 @@ def _route_lane(scenario: Scenario, session: str, plan: SessionPlan, centreline:
     pieces = [centreline.edge(a, b) for a, b in pairwise(plan.route)]
     widths = np.concatenate([np.full(len(points), section.width_m) for points, section in pieces])
     line = np.concatenate([points for points, _ in pieces])
-    dense = resample(line, _STEP_M)
+    dense = resample(line, LANE_STEP_M)
     width_m = np.interp(np.linspace(0, 1, len(dense)), np.linspace(0, 1, len(line)), widths)
     headings = headings_of(dense)
-    turn = np.gradient(np.unwrap(np.arctan2(headings[:, 1], headings[:, 0]))) / _STEP_M
+    turn = np.gradient(np.unwrap(np.arctan2(headings[:, 1], headings[:, 0]))) / LANE_STEP_M
     low, high = side_bounds(fixed, dense, headings, turn, body_heights_m(scenario, plan), width_m, platform.clearance_m)
     flown_over_m = body_heights_m(scenario, plan)[0] - AIR_BELOW_M if platform.kind == "quadrotor" else 0.0
     return Lane(session, dense[:, :2], headings, low, high, platform.clearance_m, flown_over_m)

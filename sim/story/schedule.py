@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
-from cdpipe.core.geometry import stream
+from cdpipe.core.errors import InputWarning
+from cdpipe.core.geometry import Float64Array, stream
 from scenarios.schema import Prop, Scenario
 from sim.displacement.growth import CREEPING
-from sim.placement.lanes import Lane, build_lanes
+from sim.placement.lanes import LANE_STEP_M, SPARE_M, Lane, build_lanes
 from sim.placement.placing import Standing, bounding_rectangle, grow_rectangle, rectangles_overlap
 from sim.scene import Ground
 from sim.story.state import SessionState, Where, changing_props, name_session, possible_places
@@ -29,7 +31,8 @@ def draw_states(scenario: Scenario, ground: Ground, seed: int, n_sessions: int) 
     and a prop ages, at one session. Convergence, heave and fill grow in every session; other rock changes at one.
 
     A session in which two props would stand in each other, or bar the way, is drawn again, up to 40 times. If none
-    fits, its props are those of the scenario's before session.
+    fits, its props are those of the scenario's before session, and a warning tells it. The way is barred where the gap
+    is less than what the placing of props keeps free and less than what the first and the last session leave there.
 
     Args:
         scenario: The scenario as drawn.
@@ -39,19 +42,15 @@ def draw_states(scenario: Scenario, ground: Ground, seed: int, n_sessions: int) 
     """
     shares = _draw_shares(scenario, seed, n_sessions)
     fixed = {prop.name: _draw_turn(prop, seed, n_sessions) for prop in changing_props(scenario) if _happens_once(prop)}
-    lanes = build_lanes(scenario, ground.centreline, ground.around.fixed)
-    if ground.around.after is not None:
-        lanes += build_lanes(scenario, *ground.around.after)
-    states = []
-    for number in range(1, n_sessions + 1):
-        own_shares = {name: steps[number - 1] for name, steps in shares.items()}
+    steps = [{name: each[number] for name, each in shares.items()} for number in range(n_sessions)]
+    first = _end_state(scenario, 1, steps[0], is_first=True)
+    last = _end_state(scenario, n_sessions, steps[-1], is_first=False)
+    ways = _measure_ways(scenario, ground, first, last)
+    states = [first]
+    for number in range(2, n_sessions):
         once: dict[str, Where] = {name: "before" if number < turn else "after" for name, turn in fixed.items()}
-        if number in (1, n_sessions):
-            state = _end_state(scenario, number, own_shares, is_first=number == 1)
-        else:
-            state = _draw_state(scenario, ground, lanes, (seed, n_sessions, number), own_shares, once)
-        states.append(state)
-    return tuple(states)
+        states.append(_draw_state(scenario, ground, ways, (seed, n_sessions, number), steps[number - 1], once))
+    return (*states, last)
 
 
 def stands_in(item: Standing, state: SessionState) -> bool:
@@ -76,7 +75,7 @@ def _end_state(scenario: Scenario, number: int, shares: dict[str, float], *, is_
 def _draw_state(
     scenario: Scenario,
     ground: Ground,
-    lanes: Sequence[Lane],
+    ways: Sequence[_Way],
     key: tuple[int, int, int],
     shares: dict[str, float],
     once: Mapping[str, Where],
@@ -94,13 +93,19 @@ def _draw_state(
             drawn = stream(seed, *purpose, "prop", prop.name, str(attempt)).random()
             places[prop.name] = choices[int(drawn * len(choices))]
         state = SessionState(name=name, plan="before" if is_early else "after", places=places, shares=shares)
-        if _has_room([item for item in ground.standing if stands_in(item, state)], lanes, state):
+        if _has_room([item for item in ground.standing if stands_in(item, state)], ways, state):
             return state
+    warnings.warn(
+        f"{name}: in {_TRIES} draws its props stood in one another or barred the way: those that come, go or move are "
+        "as in the before session: set them farther apart, or lower platform.clearance_m",
+        InputWarning,
+        stacklevel=3,
+    )
     first = _end_state(scenario, number, shares, is_first=True)
     return first.model_copy(update={"places": first.places | dict(once)})
 
 
-def _has_room(standing: Sequence[Standing], lanes: Sequence[Lane], state: SessionState) -> bool:
+def _has_room(standing: Sequence[Standing], ways: Sequence[_Way], state: SessionState) -> bool:
     """Tell whether no prop stands in another one, and the robot gets by."""
     outlines = {id(item): bounding_rectangle(item) for item in standing}
     for one, other in combinations(standing, 2):
@@ -109,13 +114,47 @@ def _has_room(standing: Sequence[Standing], lanes: Sequence[Lane], state: Sessio
             grow_rectangle(outlines[id(one)], _APART_M), outlines[id(other)]
         ):
             return False
-    here = [replace(item, sessions=frozenset({"before", "after"})) for item in standing]
-    for lane in lanes:
-        if lane.session == state.plan:
-            taken = [lane.taken_by(item) for item in here]
-            if not all(lane.is_open(taken[: number + 1]) for number in range(len(taken))):
-                return False
-    return True
+    own = [way for way in ways if way.lane.session == state.plan]
+    return all((_gaps_m(way.lane, standing) >= way.needed_m).all() for way in own)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Way:
+    """A lane, and the gap (N,) that props are to leave at each of its stations."""
+
+    lane: Lane
+    needed_m: Float64Array
+
+
+def _measure_ways(scenario: Scenario, ground: Ground, first: SessionState, last: SessionState) -> list[_Way]:
+    """Return the lanes of both drives on the rock of either session; the first and the last state are known to fit.
+
+    The placing of props tests no lane for those at given places: the drive through them shows that a robot gets by.
+    """
+    lanes = build_lanes(scenario, ground.centreline, ground.around.fixed)
+    if ground.around.after is not None:
+        lanes += build_lanes(scenario, *ground.around.after)
+    driven = []
+    for lane, state in ((lanes[0], first), (lanes[-1], last)):
+        gaps_m = _gaps_m(lane, [item for item in ground.standing if stands_in(item, state)])
+        driven += [(lane, point, gap_m) for point, gap_m in zip(lane.points, gaps_m, strict=True) if gap_m < SPARE_M]
+    ways = [_Way(lane, np.full(len(lane.points), SPARE_M)) for lane in lanes]
+    for way in ways:
+        for lane, point, gap_m in driven:
+            if way.lane.clearance_m <= lane.clearance_m:
+                is_near = np.linalg.norm(way.lane.points - point, axis=1) < LANE_STEP_M
+                way.needed_m[is_near] = np.minimum(way.needed_m[is_near], gap_m)
+    return ways
+
+
+def _gaps_m(lane: Lane, standing: Sequence[Standing]) -> Float64Array:
+    """Return the gap (N,) that props leave at each station of a lane; infinite where they block nothing."""
+    gaps_m = np.full(len(lane.points), np.inf)
+    if standing:
+        taken = [lane.taken_by(replace(item, sessions=frozenset({"before", "after"}))) for item in standing]
+        is_barred = np.asarray(np.isfinite(np.stack(taken)[:, :, 0]).any(axis=0))
+        gaps_m[is_barred] = lane.gaps_m(taken, is_barred)
+    return gaps_m
 
 
 def _draw_shares(scenario: Scenario, seed: int, n_sessions: int) -> dict[str, list[float]]:

@@ -9,9 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.errors import InputError, InputWarning, ScenarioError
 from cdpipe.io.session import read_session
-from scenarios.schema import Mover, Place, Prop, Puddle, Scenario, Stretch, SurfaceChange, SurfacePlace
+from scenarios.schema import (
+    Aged,
+    Mover,
+    Place,
+    Prop,
+    Puddle,
+    Scenario,
+    Section,
+    Shift,
+    Stretch,
+    SurfaceChange,
+    SurfacePlace,
+)
 from sim.placement.placing import rectangles_overlap, standing_corners
 from sim.scene import WALL_GEOM, Ground, build_world, lay_ground
 from sim.session.labels import list_changes
@@ -21,7 +33,7 @@ from sim.story import PairMaker, SessionState, Story, read_story, simulate_story
 from sim.story.pairs import plan_pair
 from sim.story.schedule import draw_states, stands_in
 from sim.story.state import dump_story
-from sim.story.world import build_session_world
+from sim.story.world import build_session_world, plan_session
 from sim.view import view_folder
 
 SEED, N = 1, 6
@@ -241,6 +253,46 @@ def test_props_that_take_turns_at_one_place_never_stand_there_together(
             )
             seen.add(frozenset(item.prop.name for item in here))
     assert len(seen) == 6  # every mixture that has room
+
+
+def narrow_scenario(make_scenario: Callable[..., Scenario], width_m: float, *props: Prop) -> Scenario:
+    section = Section(width_m=width_m, height_m=3.2)
+    return make_scenario(tunnel=make_scenario().tunnel.model_copy(update={"section": section}), props=props)
+
+
+def test_props_at_given_places_come_and_go_wherever_the_two_sessions_of_the_scenario_get_by(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop]
+) -> None:
+    scenario = narrow_scenario(
+        make_scenario,
+        2.4,  # a box at a wall closes the lane in which props are drawn, and the robot gets by
+        make_prop("goes", 0.3, change="removed"),
+        make_prop("comes", 0.3, -0.9, change="added"),
+        make_prop("pushed", 0.55, -0.9, change="moved", shift=Shift(distance_m=0.3)),
+        make_prop("later", 0.8, change="added"),
+    )
+    ground = lay_ground(scenario, SEED)
+    seen, together = set(), set()
+    for seed in range(6):
+        states = draw_states(scenario, ground, seed, 6)
+        for state in states[1:-1]:
+            seen |= {(state.plan, *each) for each in state.places.items()}
+            together.add((state.places["goes"], state.places["comes"]))
+        world = build_session_world(scenario, ground, states[2])
+        plan_session(scenario, ground, world, states[2], SEED)  # which refuses a drive that props bar
+    assert len(seen) == 2 * (2 + 2 + 3 + 2)  # every prop at each of its places, in either drive
+    assert together == {("absent", "absent"), ("before", "absent"), ("absent", "after")}  # both would bar the way
+
+
+def test_a_session_without_room_for_its_props_is_told(
+    make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop]
+) -> None:
+    aged = Aged(shift_m=0.2, heading_deg=-90.0)
+    old, beside = make_prop("old", 0.5, 0.9, aged=aged), make_prop("beside", 0.5, -0.9, aged=aged)
+    scenario = narrow_scenario(make_scenario, 3.6, old, beside)  # "old" is to the middle before "beside" makes room
+    ground = lay_ground(scenario, SEED)
+    with pytest.warns(InputWarning, match=r"^session-0\d: "):
+        draw_states(scenario, ground, 3, 12)
 
 
 def pile_story(make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop]) -> Story:
