@@ -18,13 +18,26 @@ from cdpipe.core.yamlfile import suggest
 Mistake = tuple[Key, str]
 
 _NO_DRIFT = "no drift joins"
+_RECORDED = ("tunnel", "before", "after", "areas", "movers", "puddles", "sensor", "platform")
+# What a place of a prop cannot say in a recording: the value that says nothing, and why.
+_NOT_RECORDED: dict[str, tuple[Any, str]] = {
+    "between": (None, "a recording has no nodes: give at, or leave it out"),
+    "fraction": (None, "a recording has no nodes: give at, or leave it out"),
+    "area": (None, "in a recording there are no areas: give at, or leave it out"),
+    "lateral": (0, "a recording has no walls to stand at: give at, or leave it out"),
+    "posture": ("upright", "props are grafted upright: leave it out"),
+}
 
 
 def find_dangling(tree: Any) -> list[Mistake]:
     """Return every dangling reference of a drawn scenario as (key path, rule).
 
+    Of a scenario with a recording, what that has of its own or lacks.
+
     Where the nodes stand under a misspelt key, or are no mapping, the schema says so, and no reference to one is told.
     """
+    if isinstance(tree, dict) and "recording" in tree:
+        return [*_repeated_names(tree), *_recorded_mistakes(tree)]
     tunnel = mapping_at(tree, "tunnel")
     nodes = [str(name) for name in mapping_at(tunnel, "nodes")]
     elsewhere = [*_repeated_names(tree), *_area_mistakes(tree)]
@@ -94,6 +107,16 @@ def _node_mistakes(tree: Any, nodes: list[str]) -> Iterator[Mistake]:
 def _ends(drift: Any) -> list[str]:
     names = _names(items_at(drift, "nodes"))
     return [names[0], names[-1]] if names else []
+
+
+def _recorded_mistakes(tree: Any) -> Iterator[Mistake]:
+    for name in _RECORDED:
+        if tree.get(name):
+            yield (name,), f"the recording has its own: leave {name} out"
+    for key, place in _places({"props": tree.get("props")}):
+        for name, (nothing, why) in _NOT_RECORDED.items():
+            if place.get(name, nothing) not in (nothing, None):
+                yield (*key, name), why
 
 
 def _area_mistakes(tree: Any) -> Iterator[Mistake]:

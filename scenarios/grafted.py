@@ -134,19 +134,6 @@ class GraftScenario(Scenario):
     surface: tuple[RockChange, ...] = ()
     recording: Recording
 
-    @model_validator(mode="after")
-    def _only_props(self) -> GraftScenario:
-        fields = type(self).model_fields
-        own = ("tunnel", "before", "after", "areas", "movers", "puddles", "sensor", "platform")
-        said = [name for name in own if getattr(self, name) != fields[name].default]
-        if said:
-            raise ValueError(f"{said[0]}: the recording has its own: leave {', '.join(said)} out")
-        for prop in self.props:
-            postures = {place.posture for place in (prop.place, prop.to) if place is not None}
-            if postures != {"upright"}:
-                raise ValueError(f"prop {prop.name!r}: posture: props are grafted upright")
-        return self
-
 
 def take_props(scenario: dict[Any, Any]) -> dict[Any, Any]:
     """Return the plain tree of any scenario without its world: only props, without their places between nodes."""

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from cdpipe.core.errors import InputError, ScenarioError
+from cdpipe.core.files.yaml_file import parse_yaml_value
 from eval.running.pair_run import Pair
 from scenarios.grafted import GraftScenario
 from scenarios.library import check_scenario, load_grafted, load_scenario
@@ -89,6 +92,45 @@ def test_the_digest_of_a_recording_is_that_of_its_content(tmp_path: Path) -> Non
 def test_mistakes_are_told(tmp_path: Path, text: str, told: str) -> None:
     with pytest.raises(ScenarioError, match=told):
         load_scenario(write(tmp_path, text), 3)
+
+
+@pytest.mark.parametrize("key", ["place", "to"])
+@pytest.mark.parametrize(
+    ("said", "wrong", "told"),
+    [
+        ("between: [a, b], fraction: 0.5", "between", r"\['a', 'b'\]: a recording has no nodes: "),
+        ("between: [a, b], fraction: 0.5", "fraction", "0.5: a recording has no nodes: "),
+        ("lateral: 0.8", "lateral", "0.8: a recording has no walls to stand at: "),
+        ("area: here", "area", "'here': in a recording there are no areas: "),
+        ("posture: tipped", "posture", "'tipped': props are grafted upright: "),
+    ],
+)
+def test_a_place_that_no_recording_has_is_refused_at_its_line(
+    tmp_path: Path, key: str, said: str, wrong: str, told: str
+) -> None:
+    (tmp_path / "drive").mkdir()
+    moved = "change: moved, to: {}" if key == "place" else "change: moved"
+    prop = f"name: a, kind: box, size_m: [1, 1, 1], {moved},"
+    path = write(tmp_path, f"score_radius_m: 4.5\nprops:\n  - {{{prop}\n     {key}: {{{said}}}}}\n")
+    with pytest.raises(ScenarioError) as refused:
+        load_grafted(path, {"sessions": [str(tmp_path / "drive")]}, 3)
+    lines = str(refused.value).splitlines()
+    assert len(lines) == (2 if "fraction" in said else 1)
+    assert any(re.search(rf"^{re.escape(path)}:4: props\.0\.{key}\.{wrong} = {told}.*leave", line) for line in lines)
+    placed: dict[str, Any] = {"name": "a", "kind": "box", "size_m": (1, 1, 1), "change": "moved", "to": {}}
+    placed[key] = parse_yaml_value(f"{{{said}}}")
+    with pytest.raises(ValidationError, match=rf"props\.0\.{key}\."):
+        GraftScenario.model_validate({"family": "x", "props": [placed], "recording": {"sessions": ["drive"]}})
+
+
+def test_a_world_of_its_own_is_refused_at_its_line(tmp_path: Path) -> None:
+    text = "recording: {sessions: [drive.osf]}\nsensor: {mode: 512x10}\nmovers:\n  - {name: a, kind: person}\n"
+    with pytest.raises(ScenarioError) as refused:
+        load_scenario(write(tmp_path, text), 3)
+    told = [line.removeprefix(f"{tmp_path}/real.yaml") for line in str(refused.value).splitlines()]
+    assert told[0].startswith(":2: sensor = ") and told[0].endswith(": the recording has its own: leave sensor out")
+    assert told[1].startswith(":3: movers = ") and told[1].endswith(": the recording has its own: leave movers out")
+    assert not [line for line in told if line.startswith(":1:")]
 
 
 def test_of_a_scenario_with_a_tunnel_the_props_count_alone(tmp_path: Path) -> None:
