@@ -137,7 +137,8 @@ class GraftScenario(Scenario):
 
 def take_props(scenario: dict[Any, Any]) -> dict[Any, Any]:
     """Return the plain tree of any scenario without its world: only props, without their places between nodes."""
-    kept = {key: scenario[key] for key in ("family", "description", "score_radius_m", "frozen") if key in scenario}
+    own = ("family", "description", "score_radius_m", "frozen", "turnover")
+    kept = {key: scenario[key] for key in own if key in scenario}
     return {**kept, "props": [_free(prop) for prop in scenario.get("props") or ()]}
 
 

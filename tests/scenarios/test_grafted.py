@@ -144,6 +144,15 @@ def test_of_a_scenario_with_a_tunnel_the_props_count_alone(tmp_path: Path) -> No
     assert all(prop.change == "none" for prop in load_grafted("unchanged/narrow", recording, 5).props)
 
 
+@pytest.mark.parametrize("name", ["train/narrow", "train/network"])
+def test_props_of_a_scenario_change_as_they_do_in_its_tunnel(tmp_path: Path, name: str) -> None:
+    (tmp_path / "drive").mkdir()
+    drawn, whole = load_grafted(name, {"sessions": [str(tmp_path / "drive")]}, 10001), load_scenario(name, 10001)
+    changes = [(prop.name, prop.change) for prop in whole.props]
+    assert [(prop.name, prop.change) for prop in drawn.props] == changes
+    assert sum(change == "added" for _, change in changes) > 1
+
+
 def test_a_file_with_a_recording_gives_no_props_to_another(tmp_path: Path) -> None:
     path = write(tmp_path, "recording: {sessions: [drive.osf]}\n")
     with pytest.raises(ScenarioError, match=r"real.yaml:1: recording: the file names its own"):
