@@ -31,28 +31,28 @@ _SESSIONS = {"added": frozenset(("after",)), "none": _BOTH}
 def stand_props(scenario: GraftScenario, around: Surroundings, seed: int) -> list[Standing]:
     """Return every prop at each of its places, in the scenario's order; a moved or reshaped one appears twice.
 
-    The draws of one prop do not depend on other props; where they clash the later prop is drawn again.
+    Given places come first. The draws of one prop do not depend on other props; where drawn places clash the later
+    prop is drawn again.
 
     Raises:
-        ScenarioError: A prop finds no place.
+        ScenarioError: A prop finds no place, or a given place is taken.
     """
+    jobs = [job for prop in scenario.props for job in _jobs(prop, seed)]
     placed: list[Standing] = []
-    for prop in scenario.props:
-        placed += [aged for item in _stand(prop, scenario, around, placed, seed) for aged in age(item)]
-    return placed
+    found: dict[int, list[Standing]] = {}
+    for number in sorted(range(len(jobs)), key=lambda number: jobs[number][1].at is None):
+        items = _find_place(*jobs[number], scenario, around, placed, seed)
+        found[number] = [aged for item in items for aged in age(item)]
+        placed += found[number]
+    return [item for number in range(len(jobs)) for item in found[number]]
 
 
-def _stand(
-    prop: Prop, scenario: GraftScenario, around: Surroundings, placed: Sequence[Standing], seed: int
-) -> list[Standing]:
-    """Return a prop at its places."""
-    shape = shape_of(prop, seed)
-    first = Standing(prop, shape, _SESSIONS.get(prop.change, frozenset(("before",))), np.eye(4))
-    items = _find_place(first, prop.place, "place", scenario, around, placed, seed)
+def _jobs(prop: Prop, seed: int) -> Iterator[tuple[Standing, Place, str]]:
+    """Yield a prop for each of its places, and what that place is called."""
+    first = Standing(prop, shape_of(prop, seed), _SESSIONS.get(prop.change, frozenset(("before",))), np.eye(4))
+    yield first, prop.place, "place"
     if prop.to is not None:
-        goal = replace(first, sessions=frozenset(("after",)))
-        items += _find_place(goal, prop.to, "to", scenario, around, [*placed, *items], seed)
-    return items
+        yield replace(first, sessions=frozenset(("after",))), prop.to, "to"
 
 
 def _find_place(
@@ -74,7 +74,7 @@ def _find_place(
                 turned = _shifted(spot, item.prop)
                 after = replace(item, sessions=frozenset(("after",)))
                 items.append(_set_down(after, turned, scenario, around, is_given=place.at is not None))
-            _refuse_clash(items, placed)
+            _refuse_clash(items, placed, is_given=place.at is not None)
         except _UnfitError as why:
             reasons[str(why)] = reasons.get(str(why), 0) + 1
             continue
@@ -196,10 +196,10 @@ def _path_gap_m(standing: Standing, path: Float64Array) -> float:
     return float(np.hypot(*beyond.T).min())
 
 
-def _refuse_clash(items: Sequence[Standing], placed: Sequence[Standing]) -> None:
+def _refuse_clash(items: Sequence[Standing], placed: Sequence[Standing], *, is_given: bool) -> None:
     for item in items:
         corners = grow_rectangle(standing_corners(item), _BETWEEN_M)
-        if any(
-            item.sessions & other.sessions and rectangles_overlap(corners, standing_corners(other)) for other in placed
-        ):
-            raise _UnfitError("another prop stands there")
+        for other in placed:
+            if item.sessions & other.sessions and rectangles_overlap(corners, standing_corners(other)):
+                told = f"prop {other.prop.name!r} stands there: give one of them another place"
+                raise _UnfitError(told if is_given else "another prop stands there")

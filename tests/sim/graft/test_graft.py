@@ -321,6 +321,22 @@ def test_a_given_place_is_taken(recording: Session) -> None:
         plan_graft(make_graft({**box, "place": {"at": (x_m, y_m + 30, 0)}}), SEED, Recorded((recording,)), quiet)
 
 
+@pytest.mark.parametrize("key", ["place", "to"])
+def test_a_given_place_is_not_taken_by_a_drawn_prop_before_it_in_the_file(recording: Session, key: str) -> None:
+    (drawn,) = plan_graft(make_graft(PROPS[3]), SEED, Recorded((recording,)), quiet).standing
+    taken = {"at": tuple(drawn.world_T_object[:3, 3])}
+    given = {**PROPS[2], "name": "given"} | {key: taken}
+    scenario = make_graft(PROPS[3], given)
+    standing = plan_graft(scenario, SEED, Recorded((recording,)), quiet).standing
+    assert [item.prop.name for item in standing] == ["stays", "given", "given"]
+    at = 1 if key == "place" else 2
+    np.testing.assert_allclose(standing[at].world_T_object[:2, 3], taken["at"][:2], atol=1e-5)
+    assert not np.allclose(standing[0].world_T_object, drawn.world_T_object)
+    second = {**PROPS[3], "name": "second", "place": taken}
+    with pytest.raises(ScenarioError, match=r"prop '.*' cannot stand at .*: prop '.*' stands there: give one"):
+        plan_graft(make_graft(given, second), SEED, Recorded((recording,)), quiet)
+
+
 def test_a_pair_of_one_revolution_is_refused(recording: Session) -> None:
     alone = replace(recording, odom_T_sensor=recording.odom_T_sensor[:1])
     with pytest.raises(InputError, match="one revolution makes no pair"):
