@@ -52,10 +52,11 @@ def find_dangling(tree: Any) -> list[Mistake]:
         if len(set(pair)) == 2
     }
     of_drifts = list(_drift_mistakes(tunnel, nodes))
-    of_edges = [(key, _no_drift(pair, nodes)) for key, pair in _edges_named(tree) if frozenset(pair) not in edges]
+    named = _edges_named(tree, nodes)
+    of_edges = [(key, _no_drift(pair, nodes)) for key, pair in named if frozenset(pair) not in edges]
     if of_drifts:  # a misspelt drift joins nothing: only nodes that do not exist are worth a line of their own
         of_edges = [(key, rule) for key, rule in of_edges if not rule.startswith(_NO_DRIFT)]
-    return [*of_drifts, *of_edges, *_node_mistakes(tree, nodes), *elsewhere]
+    return [*of_drifts, *_route_mistakes(tree, nodes), *of_edges, *_node_mistakes(tree, nodes), *elsewhere]
 
 
 def _drift_mistakes(tunnel: Any, nodes: list[str]) -> Iterator[Mistake]:
@@ -69,8 +70,15 @@ def _drift_mistakes(tunnel: Any, nodes: list[str]) -> Iterator[Mistake]:
                 yield key, "a drift cannot go from a node to itself"
 
 
-def _edges_named(tree: Any) -> list[tuple[Key, list[str]]]:
-    """Return every pair of nodes between which something lies or drives, as (key path, pair)."""
+def _route_mistakes(tree: Any, nodes: list[str]) -> Iterator[Mistake]:
+    for session in ("before", "after"):
+        for position, name in enumerate(items_at(mapping_at(tree, session), "route")):
+            if isinstance(name, str) and name not in nodes:
+                yield (session, "route", position), _unknown_node(name, nodes)
+
+
+def _edges_named(tree: Any, nodes: list[str]) -> list[tuple[Key, list[str]]]:
+    """Return every pair of nodes between which something lies, or that are known and driven, as (key path, pair)."""
     found: list[tuple[Key, Any]] = []
     for index, niche in enumerate(items_at(mapping_at(tree, "tunnel"), "niches")):
         found.append((("tunnel", "niches", index, "between"), items_at(niche, "between")))
@@ -78,7 +86,7 @@ def _edges_named(tree: Any) -> list[tuple[Key, list[str]]]:
         found.append(((*key, "between"), items_at(place, "between")))
     for session in ("before", "after"):
         for position, pair in enumerate(pairwise(items_at(mapping_at(tree, session), "route")), start=1):
-            found.append(((session, "route", position), list(pair)))
+            found += [((session, "route", position), list(pair))] if all(name in nodes for name in pair) else []
     return [(key, pair) for key, pair in found if len(pair) == len(_names(pair)) == 2]
 
 

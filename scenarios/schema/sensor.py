@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from cdpipe.core.yamlfile import GrownSettings, Settings
 from scenarios.schema.values import NotNegative
@@ -19,7 +20,7 @@ class Sensor(GrownSettings):
     newer: ClassVar[frozenset[str]] = frozenset({"returns", "retroreflectors", "glass"})
 
     profile: str = "os1-32-nominal"
-    mode: Annotated[str, Field(pattern=r"^\d+x\d+$")] | None = None  # left out: the profile's own, 1024x10 if shipped
+    mode: str | None = None  # left out: the profile's own, 1024x10 if shipped
     rolling_scan: bool = True  # a pose per column; off: the sensor stands still during each revolution
     range_noise: bool = True  # by range and by the strength of the return
     dropouts: bool = True  # weak returns are lost: reflectivity, incidence, range
@@ -43,6 +44,13 @@ class Sensor(GrownSettings):
         """Write down the mode of a shipped profile, as scenarios always did; a file's own is read with the file."""
         is_shipped = isinstance(given, dict) and not str(given.get("profile", "")).endswith(".json")
         return {"mode": "1024x10", **given} if is_shipped else given
+
+    @field_validator("mode", mode="before")
+    @classmethod
+    def _has_columns_and_rate(cls, given: Any) -> Any:
+        if given is not None and not re.fullmatch(r"\d+x\d+", str(given)):
+            raise ValueError("expected a form such as 512x10: columns x revolutions per second")
+        return given
 
     @model_validator(mode="after")
     def _sees_something(self) -> Sensor:

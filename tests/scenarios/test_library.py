@@ -291,6 +291,26 @@ def test_references_between_drifts_props_and_routes_are_checked(tmp_path: Path) 
     )
 
 
+@pytest.mark.parametrize(
+    ("route", "told"),
+    [
+        ("[a, bb, c]", [":20: after.route.1 = 'bb': no node of the tunnel is called bb"]),
+        ("[aa, b, cc]", [":20: after.route.0 = 'aa': ", ":20: after.route.2 = 'cc': "]),
+        ("[a, [b], cc]", [":20: after.route.2 = 'cc': ", ":20: after.route.1 = ['b']: "]),
+        ("[a, bb, cc]", [":20: after.route.1 = 'bb': ", ":20: after.route.2 = 'cc': "]),
+    ],
+)
+def test_an_unknown_node_of_a_route_is_told_once_with_its_own_name(tmp_path: Path, route: str, told: list[str]) -> None:
+    text = WORLD.replace("route: [a, b, c], start_m: 2", f"route: {route}")
+    assert_each_begins(mistakes_of(written(tmp_path, text)), told)
+
+
+@pytest.mark.parametrize("mode", ["512", "512x", "[512, 10]"])
+def test_a_mode_of_another_form_is_told_an_example(tmp_path: Path, mode: str) -> None:
+    with pytest.raises(ScenarioError, match=r"^--set: sensor.mode = .*: expected a form such as 512x10"):
+        load_scenario("smoke/one_box", 0, [f"sensor.mode={mode}"])
+
+
 def test_areas_and_niches_are_checked_with_lines(tmp_path: Path) -> None:
     text = WORLD.replace(
         "before:",
