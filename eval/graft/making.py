@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from cdpipe.core.errors import InputError, MergeFailedError, ScenarioError
@@ -14,7 +15,7 @@ from cdpipe.io.foreign import HowToRead, guess_format
 from cdpipe.io.foreign.sniff import OUSTER
 from cdpipe.io.known_merge import read_known_merge
 from cdpipe.io.readers import RecordedScans, import_ouster, open_session
-from cdpipe.io.session import Session, read_session
+from cdpipe.io.session import ScanChunk, Session, read_session
 from cdpipe.model.config import load_config
 from cdpipe.pipeline import Hooks, detect_merge, map_pair
 from eval.core.output import new_folder
@@ -100,9 +101,21 @@ def _open(path: Path, how: HowToRead, folder: Path, on_progress: Progress) -> Se
             raise InputError(f"{path}: a map without its scans has no rays to cast along: name the scans instead")
         return as_session(source)
     folder.mkdir()
-    session = folder / path.name
-    import_ouster(path, session, how, on_progress)
-    return read_session(session)
+    import_ouster(path, folder / path.name, how, on_progress)
+    stored = read_session(folder / path.name)
+    told = {field.name: getattr(stored, field.name) for field in fields(stored)}
+    return _Imported(**told | {"path": path}, stored=stored)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Imported(Session):
+    """A session that was imported into a temporary folder; `path` is the recording's file, which messages name."""
+
+    stored: Session
+
+    def chunk(self, index: int) -> ScanChunk:
+        """Return one chunk."""
+        return self.stored.chunk(index)
 
 
 def _find_merge(sessions: tuple[Session, ...], on_progress: Progress) -> Float64Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,10 +13,12 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import invert, transform
+from cdpipe.io.foreign import HowToRead
 from cdpipe.io.ply import write_ply_points
 from cdpipe.io.readers import RecordedScans, open_session
 from cdpipe.io.session import read_session
 from cdpipe.pipeline import detect
+from eval.graft import making
 from eval.graft.adapters import list_adapters, locate_recording
 from eval.graft.clouds import as_session
 from eval.graft.making import make_pair
@@ -71,6 +75,24 @@ def test_one_recording_named_twice_is_refused(simulated: Path, tmp_path: Path) -
     with pytest.raises(InputError, match="one and the same recording: name it once"):
         make_pair(graft(simulated / "before", simulated / "before"), SEED, tmp_path / "pair")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["drive.osf", "drive.pcap"])
+def test_messages_name_the_file_of_a_recording_that_is_imported(
+    simulated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    def import_simulated(path: Path, out: Path, how: HowToRead, report: object) -> None:
+        shutil.copytree(simulated / "before", out)
+
+    monkeypatch.setattr(making, "import_ouster", import_simulated)
+    (tmp_path / name).write_bytes(b"stands for packets")
+    scenario = graft(tmp_path / name, split="passes", format=Path(name).suffix[1:])
+    with pytest.raises(InputError, match=rf"^{re.escape(str(tmp_path / name))}: "):
+        make_pair(scenario, SEED, tmp_path / "pair")
+    with making.open_recorded(scenario.recording) as recorded:
+        (session,) = recorded.sessions
+        given = read_session(simulated / "before")
+        np.testing.assert_array_equal(session.chunk(0).range_mm, given.chunk(0).range_mm)
 
 
 def write_scans(session: Path, folder: Path, command: Command) -> Path:
