@@ -73,12 +73,17 @@ def judge_width(width_m: float, file: MeshFile, is_sure: bool) -> list[str]:
     raw = width_m / UNIT_M[file.units]
     likely = [unit for unit, scale in UNIT_M.items() if _LIKELY_WIDTH_M[0] <= raw * scale <= _LIKELY_WIDTH_M[1]]
     likely.sort(key=lambda unit: abs(np.log(raw * UNIT_M[unit] / 5.0)))
-    hint = " or ".join(f"--units {unit} ({raw * UNIT_M[unit]:.2g} m)" for unit in likely) or "scale the file"
+    units = " or ".join(f"--units {unit} ({raw * UNIT_M[unit]:.2g} m)" for unit in likely)
+    told = f"{width_m:.3g} m across"
     if not _WIDTH_M[0] <= width_m <= _WIDTH_M[1]:
-        raise ScenarioError(f"{file.path}: its drifts are {width_m:.3g} m across: is it in other units? give {hint}")
+        expected = f"expected {_WIDTH_M[0]:g} to {_WIDTH_M[1]:g} m: scale the file"
+        hint = f"is it in other units? give {units}" if units else expected
+        if width_m < _WIDTH_M[0]:
+            hint = f"of a lining with a thickness keep its inner surface only; else {hint}"
+        raise ScenarioError(f"{file.path}: its drifts are {told}: {hint}")
     if file.units in likely or is_sure:
         return []
-    return [f"its drifts are {width_m:.3g} m across: if that is not so, give {hint}"]
+    return [f"its drifts are {told}: if that is not so, {f'give {units}' if units else 'scale the file'}"]
 
 
 def refuse_turned(mesh: Mesh, file: MeshFile, is_sure: bool) -> None:

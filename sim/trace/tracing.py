@@ -171,9 +171,9 @@ def _parts_of(middles: Sequence[Middle], walls: _Walls) -> list[list[Middle]]:
     lengths_m = {label: sum(middle.length_m for middle in members) for label, members in found.items()}
     long = [label for label in found if lengths_m[label] > _PART_WIDTHS * walls.width_m]
     if not long:
+        told = f"its line is {max(lengths_m.values(), default=0.0):.1f} m long, shorter than {_PART_WIDTHS:g} widths"
         raise ScenarioError(
-            f"{walls.file.path}: no drift in it: what it encloses is about as long as wide "
-            f"({walls.width_m:.3g} m across): expected a tunnel"
+            f"{walls.file.path}: no drift in it: {told} ({_PART_WIDTHS * walls.width_m:.1f} m): give a longer tunnel"
         )
     return [found[label] for label in sorted(long, key=lambda label: -lengths_m[label])]
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -136,6 +137,29 @@ def test_scaled_turned_and_roofless_meshes_are_noticed(tube: Callable[..., trime
     assert "no drift in it" in refusal(saved(ball, "ball.stl"))
     sheet = trimesh.Trimesh([[0, 0, 0], [50, 0, 0], [0, 50, 0], [50, 50, 0]], [[0, 1, 2], [1, 3, 2]])
     assert "no inside" in refusal(saved(sheet, "sheet.stl"))
+
+
+def test_refusals_of_odd_widths_tell_a_way_out(tube: Callable[..., trimesh.Trimesh], saved: Save) -> None:
+    tenth, slim = tube(), tube()
+    tenth.apply_scale(0.1)
+    told = refusal(saved(tenth, "tenth.stl"))
+    assert "give scale" not in told and told.endswith("expected 0.5 to 60 m: scale the file")
+    slim.apply_scale(0.25)
+    (note,) = trace_mesh(MeshFile(path=saved(slim, "slim.stl"))).notes
+    assert "give scale" not in note and note.endswith("if that is not so, scale the file")
+    inner, outer = tube(), tube()
+    outer.apply_scale((1.05, 1.1, 1.1))
+    outer.vertices[:, 2] -= 0.1
+    outer.invert()
+    assert "of a lining with a thickness keep its inner surface only" in refusal(saved(inner + outer, "lining.stl"))
+
+
+def test_a_line_too_short_for_a_drift_is_told_with_both_lengths(
+    tube: Callable[..., trimesh.Trimesh], saved: Save
+) -> None:
+    told = refusal(saved(tube(9.0), "short.stl"))
+    assert (found := re.search(r"its line is ([\d.]+) m long, shorter than 3 widths \(([\d.]+) m\)", told))
+    assert 0 < float(found[1]) < float(found[2])
 
 
 def test_a_mine_on_its_side_is_noticed(mine: Any, saved: Save) -> None:
