@@ -13,15 +13,16 @@ import numpy as np
 import pandas as pd
 
 from eval.core.domains import domain_name
+from eval.report.comparing.columns import COMPARED, figures_of
 from eval.report.comparing.differences import NOISE, SAME, TOO_FEW, judge_methods
 from eval.report.hardness import count_held, name_breaks
 from eval.report.summary import HEADLINES, rank_methods
 from eval.report.surface.surface import SURFACE_COLUMNS
 from eval.running.results.grids import off_grids
 from eval.running.results.run_data import RunData, ends_at_merge, plan_name, shown_variant, stored_table
-from eval.tables.columns import Column, share
+from eval.tables.columns import Column, select, share
 from eval.tables.merge_table import ALL_FAMILIES
-from eval.tables.rows import ALL_DOMAINS, PAIR, is_told_the_truth, numbers, records
+from eval.tables.rows import ALL_DOMAINS, PAIR, is_told_the_truth, numbers, records, with_domain, with_pair
 
 _MOST_NAMES = 3
 _NEXT_SETTING = re.compile(r",(?=[a-z0-9_.-]+=)")
@@ -30,6 +31,7 @@ _TOO_LITTLE = "The run holds too little to compare two methods."
 _SUBJECT = "change detection between two LiDAR sessions of a tunnel"
 _RIGHT = Column("right", "share of the pairs merged as their kind asks", "high", share)
 _HELD = Column("held", "axes on which it holds", "high", lambda n: f"{n:.0f}")
+_WITHIN, _ALARM = select(COMPARED, "is_within_target", "is_alarm")
 _SILENT = Column("silent_share", "share of the unchanged pairs without a false region", "high", share)
 
 
@@ -51,7 +53,7 @@ def write_answer(data: RunData, merges: pd.DataFrame) -> str:
         merges: As `eval.tables.merge_table.merge_table` returns it.
     """
     if ends_at_merge(data):
-        return _of_merges(merges)
+        return _of_merges(data, merges)
     told = _of_axes(data) or _of_surfaces(data) or _of_pairs(data) or _of_silence(data)
     return told or _TOO_LITTLE
 
@@ -66,8 +68,9 @@ def name_leaders(
     Args:
         values: Name and value of each method, NaN where it is undefined.
         column: Which direction wins, and how values are written.
-        judge: Gives the verdict on two methods. The first of the best is "before" the first of the next only where
-            they differ beyond noise, or where there are too few pairs to tell, which is said.
+        judge: Gives the verdict on two methods, "" for none. The first of the best is "before" the first of the next
+            only where they differ beyond noise, or where there are too few pairs to tell, which is said. Without a
+            verdict the next comes "then".
     """
     fair = [(name, value) for name, value in values if not is_told_the_truth(name) and math.isfinite(value)]
     if len(fair) < 2:
@@ -81,7 +84,7 @@ def name_leaders(
         return f"all {len(leaders)} methods alike ({best})"
     second, followers = others[0]
     found = judge(leaders[0], followers[0]) if judge is not None else ""
-    link = "not told from" if found in (NOISE, SAME) else "before"
+    link = {"": "then", NOISE: "not told from", SAME: "not told from"}.get(found, "before")
     told = f"{_joined(leaders)} ({best}), {link} {_joined(followers)} ({second})"
     return f"{told}, on too few pairs for a verdict" if found == TOO_FEW else told
 
@@ -152,15 +155,17 @@ def _told(table: pd.DataFrame, column: Column, judge: Callable[[str, str, str], 
 def _of_pairs(data: RunData) -> str:
     ranked, shown, figures = rank_methods(data)
     column = next((column for column in HEADLINES if column in shown and column.better == "high"), None)
-    if column is None:
-        return ""
+    return "" if column is None else _told(ranked, column, partial(_judge_in_domain, data, figures, column))
 
-    def judge(domain: str, first: str, second: str) -> str:
-        own = figures[figures["domain"] == domain]
-        of_method = {name: own[own["variant"] == name].set_index(PAIR) for name in (first, second)}
-        return judge_methods(of_method, column, first, second, data)
 
-    return _told(ranked, column, judge)
+def _judge_in_domain(data: RunData, figures: pd.DataFrame, column: Column, domain: str, first: str, second: str) -> str:
+    return _judge_pairs(data, figures[figures["domain"] == domain], column, first, second)
+
+
+def _judge_pairs(data: RunData, figures: pd.DataFrame, column: Column, first: str, second: str) -> str:
+    """Return the verdict on two methods over the pairs of some figures (`figures_of`), "" where none can be given."""
+    of_method = {name: figures[figures["variant"] == name].set_index(PAIR) for name in (first, second)}
+    return judge_methods(of_method, column, first, second, data)
 
 
 def _judge_by_name(
@@ -182,6 +187,7 @@ def _of_axes(data: RunData) -> str:
 
 
 def _of_surfaces(data: RunData) -> str:
+    # a limit is of the windows of all pairs together, so no difference of pairs can be taken
     table = off_grids(stored_table(data, "surface_table"), data)
     limits = [column for column in SURFACE_COLUMNS if column.heading.startswith("limit, ")]
     defined = [column for column in limits if len(table) and np.isfinite(numbers(table, column.key)).sum() > 1]
@@ -192,15 +198,20 @@ def _of_surfaces(data: RunData) -> str:
 
 def _of_silence(data: RunData) -> str:
     table = off_grids(stored_table(data, "regions_table"), data)
-    return _told(table[table["n_unchanged"] > 0], _SILENT) if len(table) else ""
+    if len(table) == 0:
+        return ""
+    judge = partial(_judge_in_domain, data, figures_of(with_domain(data.results)), _ALARM)
+    return _told(table[table["n_unchanged"] > 0], _SILENT, judge)
 
 
-def _of_merges(merges: pd.DataFrame) -> str:
+def _of_merges(data: RunData, merges: pd.DataFrame) -> str:
     rows: list[dict[str, Any]] = records(merges[merges["family"] == ALL_FAMILIES]) if len(merges) else []
     counts: dict[str, list[float]] = {}
     for row in rows:
         count = counts.setdefault(str(row["variant"]), [0.0, 0.0])
         count[0] += float(row["n_within_target"])
         count[1] += float(row["n_pairs"])
-    leaders = name_leaders([(name, right / n if n else math.nan) for name, (right, n) in counts.items()], _RIGHT)
+    shares = [(name, right / n if n else math.nan) for name, (right, n) in counts.items()]
+    figures = figures_of(with_pair(pd.DataFrame(list(data.results))))
+    leaders = name_leaders(shares, _RIGHT, partial(_judge_pairs, data, figures, _WITHIN))
     return f"Highest {_RIGHT.heading}: {leaders}." if leaders else _TOO_LITTLE

@@ -110,7 +110,7 @@ def test_a_step_that_was_not_run_gives_no_verdict(plan: Plan) -> None:
     assert points.loc[("height", "tunnelcd"), "is_measured"]
 
 
-TOLD = "Holds on most axes: tunnelcd (1), before c2c (0); tunnelcd breaks at keyframes (4)."
+TOLD = "Holds on most axes: tunnelcd (1), then c2c (0); tunnelcd breaks at keyframes (4)."
 
 
 def write_run(folder: Path, plan: Plan, found: dict[tuple[str, str], tuple[str, str]]) -> Path:

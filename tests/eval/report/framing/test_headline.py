@@ -7,10 +7,13 @@ from typing import Any
 import pandas as pd
 import pytest
 
+from eval.plans.targets import read_targets
+from eval.report.comparing.differences import BETTER, NOISE, SAME, TOO_FEW, WORSE
 from eval.report.framing.headline import name_by_setting, name_leaders, name_without_shared, write_answer, write_title
 from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
 from eval.tables.columns import Column, share
+from eval.tables.merge_table import merge_table
 
 HIGH, LOW = (Column("a", "share", better, share) for better in ("high", "low"))
 NAN = float("nan")
@@ -25,20 +28,35 @@ def run(folder: Path, rows: list[dict[str, Any]] | None = None, **plan: Any) -> 
 @pytest.mark.parametrize(
     ("values", "told"),
     [
-        ([("a", 0.5), ("b", 0.9), ("c", 0.1)], "b (0.90), before a (0.50)"),
-        ([("a", 0.904), ("b", 0.9), ("c", 0.1)], "a and b (0.90), before c (0.10)"),
+        ([("a", 0.5), ("b", 0.9), ("c", 0.1)], "b (0.90), then a (0.50)"),
+        ([("a", 0.904), ("b", 0.9), ("c", 0.1)], "a and b (0.90), then c (0.10)"),
         ([("a", 0.5), ("b", 0.5)], "all 2 methods alike (0.50)"),
-        ([*((name, 1.0) for name in "abcde"), ("f", 0.0)], "a, b, c and 2 more (1.00), before f (0.00)"),
+        ([*((name, 1.0) for name in "abcde"), ("f", 0.0)], "a, b, c and 2 more (1.00), then f (0.00)"),
         ([("a", 0.5), ("oracle-merge", 0.9), ("b", NAN)], ""),
         ([], ""),
     ],
 )
 def test_leaders_by_hand(values: list[tuple[str, float]], told: str) -> None:
-    assert name_leaders(values, HIGH) == told
+    assert name_leaders(values, HIGH) == told  # nothing was judged, so nobody leads
 
 
 def test_where_less_is_better_the_least_leads() -> None:
-    assert name_leaders([("a", 0.5), ("b", 0.1)], LOW) == "b (0.10), before a (0.50)"
+    assert name_leaders([("a", 0.5), ("b", 0.1)], LOW) == "b (0.10), then a (0.50)"
+
+
+@pytest.mark.parametrize(
+    ("verdict", "told"),
+    [
+        (BETTER, "a (0.90), before b (0.50)"),
+        (WORSE, "a (0.90), before b (0.50)"),
+        (TOO_FEW, "a (0.90), before b (0.50), on too few pairs for a verdict"),
+        (NOISE, "a (0.90), not told from b (0.50)"),
+        (SAME, "a (0.90), not told from b (0.50)"),
+        ("", "a (0.90), then b (0.50)"),
+    ],
+)
+def test_who_is_before_whom_by_the_verdict(verdict: str, told: str) -> None:
+    assert name_leaders([("a", 0.9), ("b", 0.5)], HIGH, lambda first, second: verdict) == told
 
 
 @pytest.mark.parametrize(
@@ -131,6 +149,59 @@ def test_a_leader_within_noise_is_not_told_from_the_next(tmp_path: Path) -> None
     assert "a (0.50), not told from b (0.40)" in write_answer(run(tmp_path, rows), pd.DataFrame())
 
 
+def test_without_the_candidates_of_regions_csv_no_lead_in_pooled_recall_is_claimed(tmp_path: Path) -> None:
+    rows = [{"scenario": "narrow", "seed": seed, "variant": name} for seed in range(8) for name in "ab"]
+    table = [
+        {"domain": "in", "variant": name, "n_pairs": 8, "n_unchanged": 0, "recall_at_0.1": value,
+         "recall_at_0.1_low": value, "recall_at_0.1_high": value}
+        for name, value in (("a", 1.0), ("b", 0.94))
+    ]  # fmt: skip
+    pd.DataFrame(table).to_csv(tmp_path / "regions_table.csv", index=False)
+    told = write_answer(run(tmp_path, rows), pd.DataFrame())
+    assert told == "Highest recall at 0.1 false / 100 m, in distribution: a (1.00), then b (0.94)."
+
+
+@pytest.mark.parametrize(
+    ("n_alarms", "told"),
+    [(8, "a (1.00), before b (0.00)"), (1, "a (1.00), not told from b (0.88)")],
+)
+def test_silence_is_judged_by_the_alarms_on_unchanged_pairs(tmp_path: Path, n_alarms: int, told: str) -> None:
+    rows = [
+        {"scenario": "narrow", "seed": seed, "variant": name, "is_unchanged_pair": True, "n_observable": 0,
+         "is_alarm": name == "b" and seed < n_alarms}
+        for seed in range(8) for name in "ab"
+    ]  # fmt: skip
+    table = [
+        {"domain": "in", "variant": name, "n_pairs": 8, "n_unchanged": 8, "silent_share": value}
+        for name, value in (("a", 1.0), ("b", 1.0 - n_alarms / 8))
+    ]
+    pd.DataFrame(table).to_csv(tmp_path / "regions_table.csv", index=False)
+    silence = "Highest share of the unchanged pairs without a false region, in distribution"
+    assert write_answer(run(tmp_path, rows), pd.DataFrame()) == f"{silence}: {told}."
+
+
+@pytest.mark.parametrize(("n_wrong", "told"), [(8, "before b (0.00)"), (1, "not told from b (0.88)")])
+def test_merges_are_judged_pair_by_pair(tmp_path: Path, n_wrong: int, told: str) -> None:
+    rows = [
+        {"scenario": "narrow", "seed": seed, "variant": name, "pair_kind": "clean", "merge_error_deg": 0.0,
+         "merge_error_m": 9.0 if name == "b" and seed < n_wrong else 0.0}
+        for seed in range(8) for name in "ab"
+    ]  # fmt: skip
+    data = run(tmp_path, rows, until="merge")
+    merges = merge_table(pd.DataFrame(list(data.results)), read_targets(data.provenance))
+    assert write_answer(data, merges) == f"Highest share of the pairs merged as their kind asks: a (1.00), {told}."
+
+
+def test_a_limit_of_displacement_is_of_no_pair_so_it_is_not_judged(tmp_path: Path) -> None:
+    table = [
+        {"domain": "in", "variant": name, "surface_limit_1m2_m": value} for name, value in (("a", 0.01), ("b", 0.02))
+    ]
+    pd.DataFrame(table).to_csv(tmp_path / "surface_table.csv", index=False)
+    rows = [{"scenario": "narrow", "seed": seed, "variant": name} for seed in range(8) for name in "ab"]
+    told = write_answer(run(tmp_path, rows), pd.DataFrame())
+    assert told == "Lowest displacement found on 1 m² [mm], in distribution: a (10), then b (20)."
+
+
 def test_leaders_that_differ_by_a_setting_are_named_by_it(tmp_path: Path) -> None:
     values = {"m[a.b=x]": 0.9, "m[a.b=y,c.d=2]": 0.5, "oracle-merge[a.b=x]": 1.0}
     rows = [{"scenario": "narrow", "variant": name, "region_recall": value} for name, value in values.items()]
@@ -151,7 +222,7 @@ def test_a_plan_with_axes_says_on_how_many_its_leader_holds(tmp_path: Path) -> N
     pd.DataFrame(points).to_csv(tmp_path / "breaking_points.csv", index=False)
     rows = [{"scenario": "narrow", "variant": name} for name in ("c2c", "tunnelcd")]
     told = write_answer(run(tmp_path, rows, targets={"method": "tunnelcd"}), pd.DataFrame())
-    assert told == "Holds on most axes: tunnelcd (1), before c2c (0); tunnelcd breaks at drift (0.2 m)."
+    assert told == "Holds on most axes: tunnelcd (1), then c2c (0); tunnelcd breaks at drift (0.2 m)."
 
 
 def test_a_run_of_one_method_names_no_leader(tmp_path: Path) -> None:
