@@ -40,6 +40,7 @@ _COSTS = {_TIME: ("time of a pair [s], median", 1.0), _BYTES: ("kept of the befo
 _GREY = "#8a8a8a"
 _FRONT = Look(BLUE, 1.6)
 _MAX_IN_LEGEND = 24
+_MOST_NAMES = 8
 
 
 def front(cost: Float64Array, quality: Float64Array) -> BoolArray:
@@ -178,7 +179,13 @@ def _name_best(best: Sequence[dict[str, Any]], *, has_legend: bool) -> dict[str,
         # a name with settings is as long as the panel is wide; the legend has it
         if not (has_legend and "[" in str(point["variant"])):
             places.setdefault((point["x"], point["quality_value"]), []).append(str(point["variant"]))
-    return {together[0]: ", ".join(together) for together in places.values()}
+    return {together[0]: _join_some(together) for together in places.values()}
+
+
+def _join_some(names: Sequence[str]) -> str:
+    """Return some names in a line; of a grid hundreds can be equal, and pareto.csv has all."""
+    more = len(names) - _MOST_NAMES
+    return f"{', '.join(names[:_MOST_NAMES])}{f' and {more} more' if more > 0 else ''}"
 
 
 def _series(point: dict[str, Any], label: str, names: Sequence[str], title: str) -> Series:
@@ -198,7 +205,7 @@ def _series(point: dict[str, Any], label: str, names: Sequence[str], title: str)
 def _caption(own: pd.DataFrame) -> str:
     best = own[own["is_on_front"].astype(bool)]
     told = [
-        f"{words.partition(' [')[0]}, {domain_name(domain)}: {', '.join(names)}"
+        f"{words.partition(' [')[0]}, {domain_name(domain)}: {_join_some(names)}"
         for cost, (words, _) in _COSTS.items()
         for domain in best["domain"].unique()
         if (names := list(best[(best["cost"] == cost) & (best["domain"] == domain)]["variant"]))

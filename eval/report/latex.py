@@ -46,14 +46,14 @@ _SUBJECTS = {"regions_table": ("Finding the changed places", REGION_COLUMNS),
 def latex_tables(data: RunData) -> dict[str, str]:
     """Return summary.tex, and regions_table.tex and objects_table.tex where the tables of that name are in the run.
 
-    Points of grids are left out: their CSV files and the charts of the page hold them.
+    Points of grids are left out beside other methods: their CSV files and the charts of the page hold them.
 
     Returns:
         LaTeX sources by file name; each needs nothing but the package booktabs.
     """
     every, cases = with_domain(data.results), comparable(data)
     found = {}
-    if len(cases):  # else every variant is a point of a grid
+    if len(cases):
         words = "Every method over all its session pairs, times as medians, the rest as means"
         table = means_by_method(cases, SUMMARY_COLUMNS)
         found["summary.tex"] = _float(data, "summary", words, table, SUMMARY_COLUMNS, cases)

@@ -14,7 +14,7 @@ import pandas as pd
 from eval.core.domains import domain_name
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.report.drawing.charts import Chart
-from eval.running.results.cases import named_variants, scenarios
+from eval.running.results.cases import BEST_POINTS, named_variants, scenarios, shows_best_points
 from eval.running.results.run_data import RunData
 from eval.running.results.values import Row, defined, flag, interval_over_pairs, over_pairs, select_rows, text
 from eval.tables.columns import (
@@ -113,7 +113,7 @@ def results_table(data: RunData) -> Table:
             (scenario, (Cell(spaced(name)), *(column[index] for column in columns), Cell(status_text(groups[index]))))
             for index, name in enumerate(variants)
         ]
-    return Table(headings, tuple(rows), "Every preset on every scenario")
+    return Table(headings, tuple(rows), _captioned("Every preset on every scenario", data))
 
 
 def unchanged_table(data: RunData) -> Table:
@@ -125,7 +125,11 @@ def unchanged_table(data: RunData) -> Table:
             group = select_rows(data.results, scenario=scenario, variant=name)
             values = (Cell(column.shown(over_pairs(group, column.key))) for column in UNCHANGED_COLUMNS)
             rows.append((scenario, (Cell(spaced(name)), Cell(alarm_text(group)), *values, Cell(status_text(group)))))
-    return Table(headings, tuple(rows), "Pairs in which nothing changed")
+    return Table(headings, tuple(rows), _captioned("Pairs in which nothing changed", data))
+
+
+def _captioned(words: str, data: RunData) -> str:
+    return f"{words}; {BEST_POINTS}" if shows_best_points(data) else words
 
 
 def alarm_text(group: Sequence[Row]) -> str:

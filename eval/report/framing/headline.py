@@ -91,6 +91,8 @@ def name_leaders(
 
 def _joined(names: Sequence[str]) -> str:
     shown = [_shortened(name) for name in names[:_MOST_NAMES]]
+    if len(set(shown)) < len(shown):  # points of a grid differ in their second setting
+        shown = list(names[:_MOST_NAMES])
     if len(names) > _MOST_NAMES:
         shown.append(f"{len(names) - _MOST_NAMES} more")
     return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"

@@ -4,23 +4,35 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import pandas as pd
 
 from eval.plans.worlds import find_references, is_other_odometry
-from eval.running.results.grids import grid_points
+from eval.running.results.grids import find_grids, grid_points
 from eval.running.results.run_data import RunData
-from eval.running.results.values import Row, flag, number, select_rows, text
+from eval.running.results.values import Row, flag, number, over_pairs, select_rows, text
 from eval.tables.rows import with_domain
 
 _RUNS = 8  # whose cases are remembered
 _PICTURED = ("paper", "tunnelcd", "voxel-diff")
+BEST_POINTS = "of the points of a grid that of highest object PQ"
+
+
+class _Variants(NamedTuple):
+    """The variants of each world that repeat no other: those that are no points of a grid, and the points."""
+
+    methods: dict[str, list[str]]
+    points: dict[str, list[str]]
 
 
 def comparable(data: RunData) -> pd.DataFrame:
-    """Return the rows of results.csv of methods that are neither grid points nor repetitions, with their `domain`."""
-    names = [*scenarios(data, unchanged=False), *scenarios(data, unchanged=True)]
-    wanted = {(scenario, variant) for scenario in names for variant in named_variants(data, scenario)}
+    """Return the rows of results.csv of methods that are neither grid points nor repetitions, with their `domain`.
+
+    Of a run of nothing but grid points, those of all points.
+    """
+    methods, points = _find_variants(data)
+    wanted = {(scenario, name) for scenario, names in (methods or points).items() for name in names}
     return with_domain([row for row in data.results if (row["scenario"], row["variant"]) in wanted])
 
 
@@ -60,16 +72,48 @@ def is_unmade(row: Row) -> bool:
 
 
 def named_variants(data: RunData, scenario: str) -> list[str]:
-    """Return the variants of a scenario that are neither grid point nor repetition, in the order of results.csv."""
-    return list(_name_variants(data).get(scenario, ()))
+    """Return the variants of a scenario that are neither grid point nor repetition, in the order of results.csv.
+
+    Of a scenario with nothing but grid points, the best point of each grid: `BEST_POINTS`, over all pairs of the run.
+    """
+    return _find_variants(data).methods.get(scenario) or list(_best_points(data).get(scenario, ()))
+
+
+def shows_best_points(data: RunData) -> bool:
+    """Tell whether `named_variants` names points of grids anywhere."""
+    methods, points = _find_variants(data)
+    return bool(points.keys() - methods.keys())
 
 
 @lru_cache(maxsize=_RUNS)
-def _name_variants(data: RunData) -> dict[str, dict[str, None]]:
-    held, points, found = find_repeats(data), grid_points(data), dict[str, dict[str, None]]()
-    for world, name, _ in data.cases:
-        if (world, name) not in held and (world, name) not in points:
-            found.setdefault(world, {})[name] = None
+def _find_variants(data: RunData) -> _Variants:
+    held, on_grid = find_repeats(data), grid_points(data)
+    found = _Variants({}, {})
+    for world, name in dict.fromkeys((world, name) for world, name, _ in data.cases):
+        if (world, name) not in held:
+            kind = found.points if (world, name) in on_grid else found.methods
+            kind.setdefault(world, []).append(name)
+    return found
+
+
+@lru_cache(maxsize=_RUNS)
+def _best_points(data: RunData) -> dict[str, list[str]]:
+    """Return the best point of each grid, by scenario; of equal ones that of highest region recall, then the first."""
+    methods, points = _find_variants(data)
+    rows: dict[str, list[Row]] = {}
+    for row in data.results:
+        rows.setdefault(str(row["variant"]), []).append(row)
+
+    def rank(name: str) -> tuple[float, float]:
+        pq, recall = (over_pairs(rows[name], key) for key in ("object_pq", "region_recall"))
+        return math.inf if math.isnan(pq) else -pq, math.inf if math.isnan(recall) else -recall
+
+    found: dict[str, list[str]] = {}
+    for grid in find_grids(data):
+        own = set(grid.points.values())
+        names = [name for name in points.get(grid.scenario, ()) if name in own]
+        if names and grid.scenario not in methods:
+            found.setdefault(grid.scenario, []).append(min(names, key=rank))
     return found
 
 

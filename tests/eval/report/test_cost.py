@@ -141,6 +141,14 @@ def test_methods_at_one_place_share_a_label(tmp_path: Path) -> None:
     assert labels == ["tunnelcd", "paper, untrained"] * 2
 
 
+def test_of_many_methods_at_one_place_the_first_are_named_and_the_rest_counted(tmp_path: Path) -> None:
+    methods = {f"m-{number}": (0.9, 3.0, 5.0) for number in range(40)}
+    (chart,) = draw_pareto(pareto_table(run(tmp_path, methods)))
+    labels = [text for row in read_panels(chart.drawing) for panel in row for text in panel.texts.get("label", ())]
+    assert labels == [", ".join(list(methods)[:8]) + " and 32 more"] * 2
+    assert chart.caption.count("m-7 and 32 more") == 2
+
+
 def test_a_cost_of_nothing_leaves_the_axis_to_the_others(tmp_path: Path) -> None:
     methods = {"tunnelcd": (0.9, 3.0, 5.0), "c2c": (0.2, 2.0, 9.0)}
     tiny = {"theirs": (0.5, 5e-324, 5e-324)}

@@ -33,6 +33,8 @@ def run(folder: Path, rows: list[dict[str, Any]] | None = None, **plan: Any) -> 
         ([("a", 0.5), ("b", 0.5)], "all 2 methods alike (0.50)"),
         ([*((name, 1.0) for name in "abcde"), ("f", 0.0)], "a, b, c and 2 more (1.00), then f (0.00)"),
         ([("a", 0.5), ("oracle-merge", 0.9), ("b", NAN)], ""),
+        ([("m[a=1,b=1]", 0.9), ("n[a=1,b=2]", 0.5)], "m[a=1, …] (0.90), then n[a=1, …] (0.50)"),
+        ([("m[a=1,b=1]", 0.9), ("m[a=1,b=2]", 0.9), ("n", 0.5)], "m[a=1,b=1] and m[a=1,b=2] (0.90), then n (0.50)"),
         ([], ""),
     ],
 )
