@@ -12,7 +12,8 @@ from typing import Any
 from urllib.parse import quote
 
 from cdpipe.core.errors import InputError
-from eval.core.output import require_no_links
+from eval.core.output import require_no_links, require_replaceable
+from eval.core.tablefile import table_file
 from eval.report.render import render_page, write_file
 from eval.running.runfolder import read_json
 
@@ -20,6 +21,7 @@ _KINDS = {"notes": (".md",), "tables": (".csv", ".xz"), "pictures": (".png", ".j
 _QUESTION = re.compile(r"\| \[[^\]|]+\]\(([^)|]+)\) \| ([^|]+) \|")
 _ANSWER = re.compile(r'<p class="answer">([^<]*)</p>')
 _HEAD_BYTES = 100_000
+_MARK = b"<title>Reports (tunnelcd)</title>"
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +56,15 @@ def write_index(folder: Path) -> Path:
         Path of the page.
 
     Raises:
-        InputError: It is no folder, holds a link or no report, or cannot be written.
+        InputError: It is no folder, is a report itself, holds a link, no report or another page, or cannot be written.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder: name a folder of reports, as `reports`")
     require_no_links(folder)
+    for own in (table_file(folder / "results.csv"), folder / "provenance.json"):
+        if own.exists():
+            raise InputError(f"{folder}: is itself a report ({own.name}): name the folder that holds it")
+    require_replaceable(folder / "index.html", _MARK, "index of `tunnelcd report --index`")
     reports = list_reports(folder)
     if not reports:
         raise InputError(f"{folder}: holds no report: expected folders with a page, tables, pictures or notes")

@@ -86,6 +86,31 @@ def test_a_folder_without_reports_is_refused_on_one_line(tmp_path: Path, name: s
     assert not (tmp_path / name / "index.html").exists()
 
 
+@pytest.mark.parametrize("name", ["results.csv", "results.csv.xz", "provenance.json"])
+def test_a_folder_that_is_a_run_keeps_its_page(tmp_path: Path, name: str) -> None:
+    (tmp_path / "views").mkdir()
+    (tmp_path / "views" / "a.png").write_bytes(b"")
+    (tmp_path / name).write_bytes(b"")
+    with pytest.raises(InputError, match=r"is itself a report.*name the folder that holds it") as caught:
+        write_index(tmp_path)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "index.html").exists()
+
+
+def test_only_an_earlier_index_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "a.md").write_text("# A")
+    page = tmp_path / "index.html"
+    page.write_text("<!doctype html><title>main: a run (tunnelcd)</title>")
+    with pytest.raises(InputError, match="is no index of"):
+        write_index(tmp_path)
+    assert "main: a run" in page.read_text()
+    page.unlink()
+    first = write_index(tmp_path).read_text()
+    (tmp_path / "one" / "b.md").write_text("# B")
+    assert write_index(tmp_path).read_text() != first
+
+
 def test_a_name_that_is_not_utf_8_is_an_address(tmp_path: Path) -> None:
     (tmp_path / "one").mkdir()
     odd = os.fsdecode(b"\xff\xfe.md")
