@@ -41,7 +41,7 @@ from eval.report.scenarios import draw_scenarios
 from eval.report.settings.effects import draw_effects
 from eval.report.settings.factorial import draw_factorial, factorial_table
 from eval.report.settings.factors import draw_factors
-from eval.report.settings.grids import PQ_COLUMN, draw_grids
+from eval.report.settings.grids import PQ_COLUMN, draw_grids, name_equal_grids
 from eval.report.site.site import draw_site
 from eval.report.site.views import Views, write_views
 from eval.report.site.worst import draw_worst, worst_rows
@@ -204,10 +204,11 @@ def _sections(data: RunData, drawn: Mapping[str, Sequence[Chart]], views: Views)
         *data.missing,
         *(line for part in (*sites, links, regions, objects, surface) if part for line in part.missing),
     ]
-    missing += [] if worlds else ["No scenario with changes was run."]
+    equal_grids = name_equal_grids(data)
+    missing += equal_grids if worlds else ["No scenario with changes was run.", *equal_grids]
     if objects is None:
         missing += [] if n_unchanged else ["No unchanged pair was run, so false alarms are not measured."]
-        missing += [] if grids or drawn["factorial"] else ["No grid of two settings was run."]
+        missing += [] if grids or equal_grids or drawn["factorial"] else ["No grid of two settings was run."]
     of_regions = () if regions is None else regions.plots
     of_surface = () if surface is None else surface.plots
     charts = [

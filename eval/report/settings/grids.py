@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
+from cdpipe.core.geometry import Float64Array
 from eval.core.charts import BLACK, Axis, Drawing, Heat, Look, Panel, Series, named_ticks
 from eval.report.drawing.charts import Chart
 from eval.running.results.grids import GridOf, find_grids
@@ -31,12 +31,11 @@ N_ACROSS = 3
 
 
 def draw_grids(data: RunData) -> list[Chart]:
-    """Return a chart for every grid of two settings: a heat map of each figure that differs on it."""
+    """Return a chart for every grid of two settings: a heat map of each figure that differs on it as written."""
     found = []
     for place, grid in enumerate(find_grids(data), start=1):
-        values = {key: _values(data, grid, key) for key in _GRID_KEYS}
-        shown = [key for key, table in values.items() if len(np.unique(table[~np.isnan(table)])) > 1]
-        if shown:
+        tables = _differing(data, grid)
+        if tables:
             names = set(grid.points.values())
             seeds = {
                 row["seed"] for row in select_rows(data.results, scenario=grid.scenario) if row["variant"] in names
@@ -44,8 +43,8 @@ def draw_grids(data: RunData) -> list[Chart]:
             found.append(
                 Chart(
                     f"grid_{place}",
-                    f"{grid.preset} on {grid.scenario}: {grid.keys[0]} and {grid.keys[1]}",
-                    _drawing(grid, {_COLUMNS[key]: values[key] for key in shown}),
+                    _title(grid),
+                    _drawing(grid, tables),
                     f"Means over n = {len(seeds)} session pair{'s' if len(seeds) > 1 else ''}, medians for times; the "
                     "best cell has a frame.",
                 )
@@ -53,7 +52,22 @@ def draw_grids(data: RunData) -> list[Chart]:
     return found
 
 
-def _drawing(grid: GridOf, tables: Mapping[Column, Any]) -> Drawing:
+def name_equal_grids(data: RunData) -> list[str]:
+    """Return a sentence for every grid that has no chart."""
+    return [f"No figure differs on the grid {_title(grid)}." for grid in find_grids(data) if not _differing(data, grid)]
+
+
+def _title(grid: GridOf) -> str:
+    return f"{grid.preset} on {grid.scenario}: {grid.keys[0]} and {grid.keys[1]}"
+
+
+def _differing(data: RunData, grid: GridOf) -> dict[Column, Float64Array]:
+    """Return (rows, columns) of each figure that differs on a grid as written: what a digit hides has no colour."""
+    tables = {_COLUMNS[key]: _values(data, grid, key) for key in _GRID_KEYS}
+    return {column: table for column, table in tables.items() if len(np.unique(table[~np.isnan(table)])) > 1}
+
+
+def _drawing(grid: GridOf, tables: Mapping[Column, Float64Array]) -> Drawing:
     x, y = (named_ticks(list(grid.values[place])) for place in (1, 0))
     panels = []
     for column, table in tables.items():
@@ -65,10 +79,8 @@ def _drawing(grid: GridOf, tables: Mapping[Column, Any]) -> Drawing:
     return Drawing(rows, 90 + 26 * len(y))
 
 
-def _frames(table: Any, column: Column) -> list[Series]:
-    """Return a frame around each of the best cells, as written."""
-    written = np.array([[float(column.shown(value)) if not math.isnan(value) else math.nan for value in row]
-                        for row in table])  # fmt: skip
+def _frames(written: Float64Array, column: Column) -> list[Series]:
+    """Return a frame around each of the best cells."""
     top = np.nanmax(written) if column.better == "high" else np.nanmin(written)
     around_x, around_y = 0.48 * np.array([[-1, 1, 1, -1, -1], [-1, -1, 1, 1, -1]])
     return [
@@ -76,10 +88,12 @@ def _frames(table: Any, column: Column) -> list[Series]:
     ]
 
 
-def _values(data: RunData, grid: GridOf, key: str) -> Any:
-    """Return (rows, columns) of a figure's means on a grid, NaN where a point was not run."""
+def _values(data: RunData, grid: GridOf, key: str) -> Float64Array:
+    """Return (rows, columns) of a figure's means on a grid as written, NaN where it is undefined or was not run."""
     own = select_rows(data.results, scenario=grid.scenario)
-    return np.array([
+    means = [
         [over_pairs(select_rows(own, variant=grid.points.get((a, b))), key) for b in grid.values[1]]
         for a in grid.values[0]
-    ], dtype=np.float64)  # fmt: skip
+    ]
+    shown = _COLUMNS[key].shown
+    return np.array([[math.nan if math.isnan(mean) else float(shown(mean)) for mean in row] for row in means])

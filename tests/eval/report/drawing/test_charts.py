@@ -17,7 +17,7 @@ from eval.report.drawing.marks import trace_line
 from eval.report.regions.charts import draw_free_response, draw_roc, draw_sizes
 from eval.report.scenarios import draw_scenarios
 from eval.report.settings.factors import draw_factors, factors
-from eval.report.settings.grids import draw_grids
+from eval.report.settings.grids import draw_grids, name_equal_grids
 from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
 from tests.eval.report.drawing.drawn import DrawnSeries, read_panels
@@ -271,6 +271,24 @@ def test_a_grid_holds_means_and_frames_the_best_as_written() -> None:
         (frame,) = panel.series
         np.testing.assert_allclose(frame.points[:4].mean(axis=0), [place, place], atol=5e-3)
     assert "n = 2 session pairs" in chart.caption
+
+
+def test_a_difference_below_the_last_digit_has_no_colour_and_no_frame() -> None:
+    def of(iou: float, seconds: float) -> list[dict[str, object]]:
+        return [
+            {"scenario": "narrow", "seed": 0, "variant": f"p[a.x={a},b.y={b}]", "object_iou_point": 0.5 + iou * a,
+             "t_total_s": 1.0 + seconds * b, "false_regions_per_100m": NAN}
+            for a in (1, 2) for b in (1, 2)
+        ]  # fmt: skip
+
+    (chart,) = draw_grids(run(of(1e-4, 0.1)))
+    ((seconds,),) = read_panels(chart.drawing)
+    assert [text for text, _ in seconds.cells] == ["1.1", "1.2", "1.1", "1.2"]
+    # cells that are written alike look alike
+    assert len({colour for _, colour in seconds.cells}) == 2
+    assert name_equal_grids(run(of(1e-4, 0.1))) == []
+    assert draw_grids(run(of(1e-4, 1e-5))) == []
+    assert name_equal_grids(run(of(1e-4, 1e-5))) == ["No figure differs on the grid p on narrow: a.x and b.y."]
 
 
 def test_every_scenario_has_a_bar_for_each_method_over_its_pairs() -> None:
