@@ -129,9 +129,12 @@ def matrix_table(table: pd.DataFrame) -> Table:
 def detail_tables(table: pd.DataFrame) -> list[Table]:
     """Return every compared figure with both means, a table for each domain and each scenario."""
     found = []
-    for (scope, where), own in table.groupby(["scope", "where"], sort=False):
+    by_part: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in _records(table):
+        by_part.setdefault((row["scope"], str(row["where"])), []).append(row)
+    for (scope, where), rows in by_part.items():
         lines = []
-        for row in _records(own):
+        for row in rows:
             column = _COLUMNS[row["metric"]]
             uneven = [f"{row[f'n_only_{side}']} in {side.upper()} only" for side in "ab" if row[f"n_only_{side}"]]
             cells = (
@@ -141,7 +144,7 @@ def detail_tables(table: pd.DataFrame) -> list[Table]:
                 Cell(row["verdict"], row["verdict"] in COLOURS, colour=COLOURS.get(row["verdict"], "")),
             )  # fmt: skip
             lines.append((row["name"], cells))
-        title = domain_name(str(where)) if scope == "domain" else str(where)
+        title = domain_name(where) if scope == "domain" else where
         found.append(Table(("figure", "A", "B", "B \u2212 A", "pairs", "B is"), tuple(lines), title))
     return found
 
@@ -201,7 +204,7 @@ def _widest(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Return the rows with `name`: the variant, or that of the side that has several."""
+    """Return the rows of a whole comparison with `name`: the variant, or that of the side that has several."""
     n_a, n_b = table["variant_a"].nunique(), table["variant_b"].nunique()
     return [
         {**row, "name": f"against {row['variant_a']}" if n_a > 1 == n_b else row["variant_b"]} for row in records(table)

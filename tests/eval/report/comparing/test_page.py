@@ -76,6 +76,18 @@ def test_against_names_the_method_once(runs: tuple[Path, Path]) -> None:
     np.testing.assert_allclose(np.sort(turned.table["difference"]), np.sort(-found.table["difference"]))
 
 
+def test_a_method_has_one_name_in_every_table(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", {"tunnelcd": 0.5, "c2c": 0.2})
+    b = write_run(tmp_path / "b", {"theirs": 0.6})
+    # c2c was not run on this scenario
+    table = pd.read_csv(a / "results.csv")
+    table = table[(table["variant"] != "c2c") | (table["scenario"] != "regions/cave")]
+    table.to_csv(a / "results.csv", index=False)
+    found = compare_sides(*sides(a, f"{b}:theirs")).table
+    of_cave = next(table for table in detail_tables(found) if table.caption == "regions/cave")
+    assert {group for group, _ in of_cave.rows} == {"against tunnelcd"}
+
+
 def test_the_command_writes_table_and_page(runs: tuple[Path, Path], tmp_path: Path, command: Command) -> None:
     a, b = runs
     code, printed, err = command("report", a, b)
