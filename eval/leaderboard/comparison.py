@@ -85,7 +85,7 @@ def compare_with_reference(results: pd.DataFrame, name: str, references: Sequenc
     return Comparison(
         pd.DataFrame(rows),
         pairs,
-        pd.DataFrame(paired),
+        pd.DataFrame(paired).drop(columns="is_same", errors="ignore"),
         (*_notes(own, others, references, shared), *note_other_worlds(results, references)),
     )
 

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, Int64Array
 from eval.core.statistics import ENOUGH_PAIRS, paired_difference
 from eval.report.comparing.columns import COMPARED, figures_of, is_time
 from eval.report.pooled import POOLED, POOLED_RATE_PER_100M, rank_pairs
@@ -90,10 +91,17 @@ def paired_differences(a: pd.DataFrame, b: pd.DataFrame, seed: int = 0) -> list[
     tunnels = tunnels_of(a.index.to_frame())
     found = [
         {"metric": column.key, "good": column.better,
-         **paired_difference(numbers(a, column.key), numbers(b, column.key), seed, tunnels)}
+         **_difference(numbers(a, column.key), numbers(b, column.key), tunnels, seed)}
         for column in columns
     ]  # fmt: skip
     return [row for row in found if row["n_used"]]
+
+
+def _difference(a: Float64Array, b: Float64Array, tunnels: Int64Array, seed: int = 0) -> dict[str, Any]:
+    """Return `paired_difference`, and whether each pair with both numbers has the same one on both sides."""
+    used = ~np.isnan(a) & ~np.isnan(b)
+    is_same = bool(used.any()) and bool((a[used] == b[used]).all())
+    return {**paired_difference(a, b, seed, tunnels), "is_same": is_same}
 
 
 def verdict(row: Mapping[str, Any]) -> str:
@@ -102,10 +110,10 @@ def verdict(row: Mapping[str, Any]) -> str:
     Args:
         row: `good`, the direction ("high" or "low") in which the figure should move; `n_used` and `n_tunnels`, over
             how many session pairs of how many tunnels the difference is; `difference` and its 95 % interval `low` to
-            `high`, NaN for none.
+            `high`, NaN for none; `is_same`: no pair differs. Where that is not told, no draw of pairs may differ.
     """
     low, high = row["low"], row["high"]
-    if row["difference"] == low == high == 0.0:
+    if row.get("is_same", row["difference"] == low == high == 0.0):
         return SAME
     if row.get("n_tunnels", row["n_used"]) < ENOUGH_PAIRS or math.isnan(low):
         return TOO_FEW
@@ -188,7 +196,7 @@ def judge_methods(of_method: Mapping[str, pd.DataFrame], column: Column, first: 
     elif column.key in own[0]:
         a, b = (numbers(frame[[column.key]].loc[pairs], column.key) for frame in own)
         tunnels = tunnels_of(pairs.to_frame())
-        rows = [paired_difference(a, b, tunnels=tunnels)]
+        rows = [_difference(a, b, tunnels)]
     else:
         rows = []
     return verdict({"good": "high", **rows[0]}) if rows else ""

@@ -119,6 +119,22 @@ def test_every_column_has_a_direction_and_the_verdict_respects_it() -> None:
     assert word("high", 6, 0.0, 0.0, 0.0) == SAME
 
 
+def test_the_same_is_the_same_number_on_every_pair_however_few(write: Write) -> None:
+    plain = write("plain", [row(1, region_recall=0.5, region_auroc=0.8, region_precision=NAN)])
+    other = write("other", [row(1, region_recall=0.5, region_auroc=0.9, region_precision=NAN)])
+    found = compared(plain, other)
+    assert [the_row(found, key)["verdict"] for key in ("region_recall", "region_auroc")] == [SAME, TOO_FEW]
+    # two pairs of one tunnel differ, and their mean does not
+    worlds = ("regions/narrow", "dust/narrow")
+    up = write("up", [row(seed, world, region_recall=0.5) for seed in range(8) for world in worlds])
+    swapped = [
+        row(seed, world, region_recall=value)
+        for seed in range(8)
+        for world, value in zip(worlds, (0.25, 0.75), strict=True)
+    ]
+    assert the_row(compared(up, write("down", swapped)), "region_recall")["verdict"] == NOISE
+
+
 def word(good: str, n_used: int, difference: float, low: float, high: float) -> str:
     return verdict({"good": good, "n_used": n_used, "difference": difference, "low": low, "high": high})
 
