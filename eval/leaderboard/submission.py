@@ -30,7 +30,15 @@ from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.io.answer_parts import MAX_ERROR
 from eval.core.output import made_parents, require_replaceable, unwritable
 from eval.core.provenance import git_commit, machine, versions
-from eval.leaderboard.calls import EvaluationFile, digest_method, digest_pair, is_exchanged, read_call, read_evaluation
+from eval.leaderboard.calls import (
+    EvaluationFile,
+    digest_method,
+    digest_pair,
+    is_exchanged,
+    list_merges,
+    read_call,
+    read_evaluation,
+)
 from eval.leaderboard.given_merge import MergeMode
 from eval.running.cell_rows import TEXT_COLUMNS
 from eval.running.predictions import is_name_of_ours
@@ -261,15 +269,15 @@ def _collect(run: RunFolder, evaluation: EvaluationFile) -> tuple[list[PairPart]
 
 
 def _find_method(run: RunFolder, name: str) -> str:
-    names = [path.parent.name for path in sorted(run.path.glob("evaluations/*/evaluation.json"))]
-    if not names:
+    parts = [path.parent.name for path in sorted(run.path.glob("evaluations/*/evaluation.json"))]
+    if not parts:
         raise InputError(f"{run.path}: no method was evaluated here: `tunnelcd evaluate --out {run.path}` first")
-    told = ", ".join(map(visible, names))
-    if name and path_part(name) not in names:
+    if path_part(name) in parts or (not name and len(parts) == 1):
+        return name or parts[0]
+    told = ", ".join(map(visible, list_merges(run)))
+    if name:
         raise InputError(f"{run.path}: --as {name}: no method of this name was evaluated here, but {told}")
-    if not name and len(names) > 1:
-        raise InputError(f"{run.path}: holds {told}: name one with --as")
-    return name or names[0]
+    raise InputError(f"{run.path}: holds {told}: name one with --as")
 
 
 def _check_rows(document: Submission) -> None:

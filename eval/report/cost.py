@@ -18,6 +18,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array
 from eval.core.charts import BLACK, BLUE, Axis, Drawing, Look, Panel, Series, log_span
 from eval.core.domains import domain_name
 from eval.core.statistics import mean, median
+from eval.core.terminal.printing import count_pairs
 from eval.report.drawing.charts import Chart
 from eval.report.drawing.looks import look_of
 from eval.report.pooled import pooled_recalls
@@ -167,7 +168,7 @@ def _drawing(own: pd.DataFrame, words: str) -> Drawing:
             labels = _name_best(records(best), has_legend=len(names) <= _MAX_IN_LEGEND)
             named = [(point, labels.get(str(point["variant"]), "")) for point in records(points)]
             series = [line, *(_series(point, label, names, title) for point, label in named)]
-            row.append(Panel(x, y, series, f"{domain_name(str(domain))}, {n_pairs} pairs"))
+            row.append(Panel(x, y, series, f"{domain_name(str(domain))}, {count_pairs(n_pairs)}"))
         rows.append(row)
     return Drawing(rows, 300)
 

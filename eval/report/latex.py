@@ -17,6 +17,7 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.core.names import visible
+from eval.core.terminal.printing import count_pairs
 from eval.report.comparing.columns import COMPARED
 from eval.report.comparing.differences import is_told_apart
 from eval.report.objects.tables import OBJECT_COLUMNS
@@ -146,7 +147,8 @@ def _caption(words: str, data: RunData, results: pd.DataFrame) -> str:
     """Return the caption: the subject of a table, its number of pairs, and the meaning of its marks."""
     n_pairs, n_failed = len(results[PAIR].drop_duplicates()), int((texts(results, "status") != "ok").sum())
     name = plan_name(data)
-    told = f"{words}{f', plan {name}' if name else ''}: {n_pairs} session pairs, {results['variant'].nunique()} methods"
+    of_plan = f", plan {name}" if name else ""
+    told = f"{words}{of_plan}: {count_pairs(n_pairs)} of sessions, {results['variant'].nunique()} methods"
     n_unmade = sum(is_unmade(row) for row in records(results))
     failed = f"{n_failed - n_unmade} of {len(results)} cases without an answer, which miss all their changes"
     if n_unmade:

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from eval.tables.rows import is_told_the_truth
+
 EN_DASH = "\u2013"
 THIN_SPACE = "\u2009"
 UNDEFINED = EN_DASH
 _BILLIONTH = 1e-9
+_WITH_SETTINGS = re.compile(r"[^\[]+\[[\w.-]+=.*\]")
+_NEXT_SETTING = re.compile(r",(?=[\w.-]+=)")
 
 
 def share(value: float) -> str:
@@ -26,8 +31,13 @@ def fine(value: float) -> str:
 
 
 def spaced(variant: str) -> str:
-    """Return a variant's name with spaces where a line may break."""
-    return variant.replace("[", " [").replace(",", ", ").replace("+", " + ")
+    """Return a variant's name with spaces where a line may break: before and between its settings, at oracles' "+".
+
+    Any other name is shown as it is.
+    """
+    if is_told_the_truth(variant):
+        variant = variant.replace("+", " + ")
+    return _NEXT_SETTING.sub(", ", variant.replace("[", " [", 1)) if _WITH_SETTINGS.fullmatch(variant) else variant
 
 
 def significant(value: float) -> str:

@@ -26,7 +26,7 @@ from eval.cli.options import (
     require_method_settings,
 )
 from eval.cli.printed_results import print_comparison, print_pair_row, print_results, print_summary
-from eval.core.terminal.printing import echo, require_json_file, say, tell_json, warn
+from eval.core.terminal.printing import count_pairs, echo, require_json_file, say, tell_json, warn
 from eval.core.terminal.progress import shown_progress
 
 if TYPE_CHECKING:
@@ -224,7 +224,7 @@ def export(
     with shown_progress(quiet) as progress:
         n_written = (export_blind if blind else export_with_truth)(run, out, progress)
     told = "without truth; blind.json of the run says which is which" if blind else "with truth"
-    say(quiet, f"{out}: {n_written} pairs of sessions written now, {told}")
+    say(quiet, f"{out}: {count_pairs(n_written)} of sessions written now, {told}")
 
 
 def report(

@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 from eval.core.domains import domain_name
+from eval.core.terminal.printing import count_pairs
 from eval.report.tables import Cell, Table, interval_of_row
 from eval.tables.columns import EN_DASH, Column, count, scaled, share
 from eval.tables.object_table import ORACLE_VARIANT
@@ -71,7 +72,7 @@ def groups_table(groups: pd.DataFrame, domain: str, main: str, rivals: Sequence[
     for row in records(own[own["variant"] == main] if len(own) else own):
         of_others = [_same_group(own[own["variant"] == name], row) for name in others]
         cells = (
-            Cell(_group_name(row)), Cell(str(row["n_changes"]), interval=_pairs(int(row["n_pairs"]))),
+            Cell(_group_name(row)), Cell(str(row["n_changes"]), interval=count_pairs(int(row["n_pairs"]))),
             Cell(share(row["iou_point"]), interval=interval_of_row(row, "iou_point", share)),
             Cell(share(row["iou_matched_median"])), Cell(share(row["share_50"])), Cell(share(row["share_found"])),
             Cell(share(row["kind_accuracy"])), Cell(_cm(row["displacement_error_m"])),
@@ -84,10 +85,6 @@ def groups_table(groups: pd.DataFrame, domain: str, main: str, rivals: Sequence[
 
 
 _MEASURES = {"prop_kind": "kind of prop", "hull_volume_m3": "hull of the object [m³]"}
-
-
-def _pairs(n_pairs: int) -> str:
-    return "1 pair" if n_pairs == 1 else f"{n_pairs} pairs"
 
 
 def _group_name(row: Mapping[str, Any]) -> str:

@@ -153,7 +153,8 @@ def region_picture(
     marks = [] if truth is None else truth_marks(truth, rows["changes"])
     states = [mark.state for mark in marks]
     n_false = sum(mark.is_false for mark in regions)
-    words = [f"{len(regions)} regions{_name_radii(regions)} reported, {n_false} of them false."]
+    count = "1 region" if len(regions) == 1 else f"{len(regions)} regions"
+    words = [f"{count}{_name_radii(regions)} reported, {n_false} of them false."]
     if states and "not scored" not in states:
         n_observable = len(states) - states.count("unobservable")
         words.append(f"{states.count('found')} of {n_observable} observable changes found.")

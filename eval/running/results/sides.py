@@ -181,7 +181,8 @@ def cautions(a: Side, b: Side) -> list[str]:
     found = []
     if (worlds := other_worlds(a, b)) and not is_one_run(a, b):
         named = ", ".join(worlds[:_MAX_NAMED]) + (" and others" if len(worlds) > _MAX_NAMED else "")
-        found.append(f"{len(worlds)} shared pairs hold other changes or another drive on the two sides ({named}).")
+        told = "1 shared pair holds" if len(worlds) == 1 else f"{len(worlds)} shared pairs hold"
+        found.append(f"{told} other changes or another drive on the two sides ({named}).")
     if why := why_no_times(a, b):
         found.append(f"Times are not judged: {why}.")
     for side in {each.path: each for each in (a, b)}.values():

@@ -14,10 +14,11 @@ import pandas as pd
 import pytest
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.names import path_part
 from eval.leaderboard.calls import digest_method, read_evaluation
 from eval.leaderboard.page import write_leaderboard
 from eval.leaderboard.submission import CheckedFile, pack_submission, read_submission, score_again
-from eval.running.runfolder import RunFolder
+from eval.running.runfolder import RunFolder, write_json
 from eval.scoring import scoring
 
 ONE_BOX = "smoke/one_box"
@@ -83,6 +84,16 @@ def test_a_method_that_was_not_evaluated_is_answered_with_those_that_were(run: R
     with pytest.raises(InputError, match=r"--as nobody: no method of this name was evaluated here, but mine$"):
         pack_submission(run, "nobody", tmp_path / "x.zip")
     assert not (tmp_path / "x.zip").exists()
+
+
+def test_methods_are_told_by_their_names_and_not_by_their_folders(run: RunFolder, tmp_path: Path) -> None:
+    own = run.path / "evaluations" / "mine" / "evaluation.json"
+    document = json.loads(own.read_text())
+    write_json(run.path / "evaluations" / path_part("k: 1") / "evaluation.json", {**document, "name": "k: 1"})
+    with pytest.raises(InputError, match=r"no method of this name was evaluated here, but k: 1, mine$"):
+        pack_submission(run, "nobody", tmp_path / "x.zip")
+    with pytest.raises(InputError, match=r"holds k: 1, mine: name one with --as$"):
+        pack_submission(run, "", tmp_path / "x.zip")
 
 
 def test_results_that_lack_a_pair_are_not_packed(run: RunFolder, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from eval.report.tables import beside, best
 from eval.running.results.grids import find_grids, off_grids, split_variant
 from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
-from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, count, significant
+from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, count, significant, spaced
 
 HIGH = next(column for column in RESULT_COLUMNS if column.key == "object_iou_point")
 LOW = next(column for column in RESULT_COLUMNS if column.key == "t_total_s")
@@ -92,6 +92,19 @@ def test_a_mean_over_hardly_any_pair_is_not_the_best() -> None:
     assert best(values, HIGH, [3, 2, 3]) == [True, False, False]
     assert beside("0.1-0.2", 2, 60) == "0.1-0.2\n2 of 60 pairs"
     assert [beside("", n, 60) for n in (0, 60)] == ["", ""]
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("m[a.b=1,c.d=x]", "m [a.b=1, c.d=x]"),
+        ("m[a.b=[1, 2],c.d=x]", "m [a.b=[1, 2], c.d=x]"),
+        ("oracle-merge+oracle-regions[a.b=1]", "oracle-merge + oracle-regions [a.b=1]"),
+        *((name, name) for name in ("paper-topn", "=1+1", "a,b", "x[1],y", "c++", "[a=1]")),
+    ],
+)
+def test_only_the_settings_of_a_variant_get_spaces(name: str, shown: str) -> None:
+    assert spaced(name) == shown
 
 
 def test_variants_are_taken_apart() -> None:

@@ -327,7 +327,7 @@ def test_cautions_about_worlds_and_machines(write: Write) -> None:
     sides = [read_side(str(each)) for each in (a, b)]
     assert is_one_machine(*sides)
     assert cautions(*sides) == [
-        "1 shared pairs hold other changes or another drive on the two sides (regions/narrow 2)."
+        "1 shared pair holds other changes or another drive on the two sides (regions/narrow 2)."
     ]
     (b / "provenance.json").write_text(json.dumps({"tool": "tunnelcd", "machine": {"cpu": "another"}}))
     sides[1] = read_side(str(b))

@@ -15,7 +15,7 @@ from tests.eval.report.site.test_case_view import report
     [
         (4.5, 2, "2 regions of 4.5 m reported"),
         (np.array([10.0, 4.5]), 2, "2 regions of 4.5 to 10 m reported"),
-        (np.array([10.0, 4.5]), 1, "1 regions of 10 m reported"),
+        (np.array([10.0, 4.5]), 1, "1 region of 10 m reported"),
         (np.array([10.0, 4.5]), 0, "0 regions reported"),
     ],
 )
