@@ -2,7 +2,7 @@
 
 A sensor looks into a hollow of the roof at a flat angle, so most of its bottom is hidden. The hidden bottom is taken
 from the convex hull of what was seen: a hollow bulges into the rock. Both surfaces are heights over one plane, the
-chart of the region.
+chart of the region. Where next to nothing is hidden, the sum over the places is the better figure.
 """
 
 from __future__ import annotations
@@ -22,8 +22,13 @@ from cdpipe.surface.regions import sort_regions
 
 # Faces of the hull that stand up so steeply are its sides: part of their normal along that of the chart.
 _STEEP = 1e-3
-# Edge of a pixel of the chart, and the width of the rim around the region.
-_PIXEL_M, _RIM_M = 0.1, 0.6
+# Edge of a pixel of the chart, and the width of the rim around the region. The chart of a region that many times as
+# long as wide is turned along it.
+_PIXEL_M, _RIM_M, _LONG = 0.1, 0.6, 2.0
+# Least share of the area of a hollow without a displacement. Below it, the sum over the places stays.
+_HIDDEN = 0.01
+# A pixel farther than this from every place of the same wall is beside the wall, behind another one.
+_ON_WALL_M = 0.2
 # Rock with a normal farther from that of the region is another wall (cosine). A region with less than that share of its
 # places on one wall has no chart.
 _SAME_WALL, _ON_CHART = 0.2, 0.8
@@ -79,24 +84,28 @@ def measure_hollows(
     region: Int32Array,
     before: SurfaceCells,
     places: SurfacePlaces,
+    is_hidden: BoolArray,
     after: SurfaceCells,
 ) -> tuple[Int32Array, tuple[SurfaceRegion, ...]]:
-    """Return the region of each place and the regions anew, hollows with the area and the volume of their charts.
+    """Return the region of each place and the regions anew, partly hidden hollows with the figures of their charts.
 
     Args:
         regions: Regions of displacement.
         region: (Q,) region of each place, -1 for none.
         before: Cells of the before session.
         places: Places on them.
+        is_hidden: (Q,) whether nothing tells the displacement of a place.
         after: Cells of the after session.
     """
     measured, tree = list(regions), cKDTree(places.points)
     for index, each in enumerate(regions):
         members = np.flatnonzero(region == index)
-        found = _measure_hollow(before, places, tree, members, after) if is_hollow(each) else None
+        found = _measure_hollow(before, places, tree, members, is_hidden, after) if is_hollow(each) else None
         if found is not None:
             area_m2, volume_m3 = found
-            measured[index] = replace(each, area_m2=area_m2, volume_m3=-volume_m3, mean_m=-volume_m3 / area_m2)
+            mean_m = -volume_m3 / area_m2
+            largest_m = min(each.largest_m, mean_m)  # the deepest may be hidden
+            measured[index] = replace(each, area_m2=area_m2, volume_m3=-volume_m3, mean_m=mean_m, largest_m=largest_m)
     return sort_regions(region, measured)
 
 
@@ -106,9 +115,14 @@ def is_hollow(region: SurfaceRegion) -> bool:
 
 
 def _measure_hollow(
-    before: SurfaceCells, places: SurfacePlaces, tree: cKDTree, members: Int64Array, after: SurfaceCells
+    before: SurfaceCells,
+    places: SurfacePlaces,
+    tree: cKDTree,
+    members: Int64Array,
+    is_hidden: BoolArray,
+    after: SurfaceCells,
 ) -> tuple[float, float] | None:
-    """Return area and volume of one hollow; None where its places have no chart."""
+    """Return area and volume of one hollow; None where its places have no chart, or next to nothing of it is hidden."""
     normal = places.normals[members].mean(axis=0)
     is_flat = places.normals[members] @ normal > _SAME_WALL * np.linalg.norm(normal)
     if is_flat.mean() < _ON_CHART:
@@ -116,11 +130,19 @@ def _measure_hollow(
     members = members[is_flat]
     chart = _make_chart(places.points[members], normal / np.linalg.norm(normal))
     around = np.asarray(tree.query_ball_point(chart.origin, chart.reach_m), dtype=np.int64)
-    walls = places.points[around[places.normals[around] @ chart.axes[2] > _SAME_WALL]]
+    around = around[places.normals[around] @ chart.axes[2] > _SAME_WALL]
+    walls = chart.place(places.points[around])
+    blind = around[is_hidden[around] & chart.is_on(walls)]
+    if len(blind) == 0:
+        return None
     cells = after.points[after.tree.query_ball_point(chart.origin, chart.reach_m)]
     try:
         depth_m = _find_depths(chart, before, walls, cells)
-        is_own = _outline(chart, depth_m, places.points[members])
+        is_own = _outline(chart, depth_m, walls, places.points[members])
+        blind = blind[is_own[chart.pixels(chart.place(places.points[blind]))]]
+        blind_m2 = float(places.areas_m2[blind].sum())
+        if blind_m2 < _HIDDEN * (blind_m2 + float(places.areas_m2[members].sum())):
+            return None
         hidden, seen = (np.flatnonzero(is_own & is_part) for is_part in (np.isnan(depth_m), np.isfinite(depth_m)))
         if len(hidden) > 0 and len(seen) > 0:
             depth_m[hidden] = _span_hull(chart.middles, depth_m, seen, hidden)
@@ -131,10 +153,14 @@ def _measure_hollow(
 
 
 def _make_chart(points: Float64Array, normal: Float64Array) -> _Chart:
-    """Return the chart across a unit normal that holds the (N, 3) points and a rim."""
+    """Return the chart across a unit normal that holds the (N, 3) points and a rim; a long one is turned along them."""
+    origin = points.mean(axis=0)
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     axes = np.stack([first / np.linalg.norm(first), np.cross(normal, first / np.linalg.norm(first)), normal])
-    origin = points.mean(axis=0)
+    on = (points - origin) @ axes[:2].T
+    (across, along), turn = np.linalg.eigh(on.T @ on)
+    if along > _LONG**2 * across:
+        axes[:2] = turn.T @ axes[:2]
     on = (points - origin) @ axes[:2].T
     low, high = on.min(axis=0) - _RIM_M, on.max(axis=0) + _RIM_M
     rows, columns = np.ceil((high - low) / _PIXEL_M).astype(int)
@@ -142,11 +168,11 @@ def _make_chart(points: Float64Array, normal: Float64Array) -> _Chart:
 
 
 def _find_depths(chart: _Chart, before: SurfaceCells, walls: Float64Array, after: Float64Array) -> Float64Array:
-    """Return the (P,) depth of the (C, 3) after cells below the (N, 3) walls in each pixel; NaN where none was seen."""
-    placed, cells = chart.place(walls), chart.place(after)
+    """Return the (P,) depth of the (C, 3) after cells below the (N, 3) walls, on the chart, in each pixel; else NaN."""
+    cells = chart.place(after)
     is_over = chart.is_on(cells)
     cells, off_m = cells[is_over], before.tree.query(after[is_over])[0]
-    depths_m = _height(_rearmost(placed[chart.is_on(placed, _RIM_M)]), cells) - cells[:, 2]
+    depths_m = _height(_rearmost(walls[chart.is_on(walls, _RIM_M)]), cells) - cells[:, 2]
     is_its = (depths_m > -_IN_FRONT_M) & (depths_m < _DEEPEST_M) & ((depths_m < _DEEP_M) | (off_m > NEW * depths_m))
     pixel, depths_m, n = chart.pixels(cells[is_its]), depths_m[is_its], chart.shape[0] * chart.shape[1]
     deepest_m = np.full(n, -np.inf)
@@ -174,14 +200,15 @@ def _height(points: Float64Array, at: Float64Array) -> Float64Array:
     return np.asarray(np.where(np.asarray(distance_m)[:, 0] < _NEAR_M, heights_m, np.nan))
 
 
-def _outline(chart: _Chart, depth_m: Float64Array, members: Float64Array) -> BoolArray:
-    """Mark the (P,) pixels of the hollow: deep ones that hang together, where they hold a place of the region."""
+def _outline(chart: _Chart, depth_m: Float64Array, walls: Float64Array, members: Float64Array) -> BoolArray:
+    """Mark the (P,) pixels of the hollow: deep ones of the wall that hang together and hold a place of the region."""
     seen, hidden = np.flatnonzero(np.isfinite(depth_m)), np.flatnonzero(np.isnan(depth_m))
     if len(seen) == 0:
         return np.zeros(len(depth_m), dtype=np.bool_)
     guess_m = depth_m.copy()
     guess_m[hidden] = _height(np.column_stack([chart.middles[seen], depth_m[seen]]), chart.middles[hidden])
-    labels = ndimage.label((guess_m > _LEAST_DEPTH_M).reshape(chart.shape))[0].ravel()
+    is_on_wall = cKDTree(walls[:, :2]).query(chart.middles, distance_upper_bound=_ON_WALL_M)[0] < _ON_WALL_M
+    labels = ndimage.label((is_on_wall & (guess_m > _LEAST_DEPTH_M)).reshape(chart.shape))[0].ravel()
     own = np.unique(labels[chart.pixels(chart.place(members))])
     return np.isin(labels, own[own > 0])
 

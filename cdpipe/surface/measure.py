@@ -7,7 +7,7 @@
    after session, place by place of the sensor, and the offsets are measured again.
 5. The level of detection adds up the error of the means, the covariance of those motions, and the roughness.
 6. Objects are told from rock (`rock_or_object`), and the displacement of objects is left out.
-7. Neighbouring places beyond their level are regions (`regions`). Hollows have a hidden bottom (`hollows`).
+7. Neighbouring places beyond their level are regions (`regions`). The bottom of hollows may be hidden (`hollows`).
 """
 
 from __future__ import annotations
@@ -90,7 +90,8 @@ def measure_surface(
         shared_m=measured.shared_m,
     )  # fmt: skip
     if any(is_hollow(each) for each in regions):
-        region, regions = measure_hollows(regions, region, cells, places, measured.after or make_cells(after))
+        is_hidden, laid = np.isnan(measured.along_m), measured.after or make_cells(after)
+        region, regions = measure_hollows(regions, region, cells, places, is_hidden, laid)
     field = SurfaceField(
         places.points, places.normals, displacement_m, measured.level_m, region, regions, chainage_m, angle_deg
     )
