@@ -75,12 +75,14 @@ class SurfaceCells:
         fold_offsets: (C, N_FOLDS, 3) float32 mean of the returns of each fold, less the point; NaN without returns.
         tree: k-d tree of the points.
         map_T_sensor: (S, 4, 4) poses of the scans of the session.
+        numbers: (C,) number of each cell among the returns (`NearReturns.cell_of`).
     """
 
     points: Float64Array
     fold_offsets: Float32Array
     tree: cKDTree
     map_T_sensor: Float64Array
+    numbers: Int64Array
 
 
 def near_returns(merged: MergedMaps, session: SessionName) -> NearReturns:
@@ -175,4 +177,4 @@ def make_cells(returns: NearReturns, *, with_folds: bool = True) -> SurfaceCells
             fold_offsets[:, :, axis] = sums / weights - points[:, axis, None]
 
     in_threads(average, range(3))
-    return SurfaceCells(points, fold_offsets, cKDTree(points, balanced_tree=False), returns.map_T_sensor)
+    return SurfaceCells(points, fold_offsets, cKDTree(points, balanced_tree=False), returns.map_T_sensor, kept)

@@ -74,10 +74,11 @@ def measure_surface(
     """
     start = time.perf_counter()
     settings = config.surface
-    cells = make_cells(near_returns(merged, "before"))
-    path = merged.before.odom_T_sensor
-    places = choose_places(cells, path[:, :3, 3], settings.spacing_m, settings.normal_m)
-    chainage_m, angle_deg, _ = unroll(places.points, path)
+    returns = near_returns(merged, "before")
+    cells = make_cells(returns)
+    places = choose_places(cells, returns, settings.spacing_m, settings.normal_m)
+    del returns  # as much memory as all the rest
+    chainage_m, angle_deg, _ = unroll(places.points, merged.before.odom_T_sensor)
     after = near_returns(merged, "after")
     measured = load_method(settings.method)(cells, after, places, chainage_m, config)
     measured = _within_search(measured)

@@ -7,10 +7,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.core.geometry import Float64Array, Int64Array, travelled_m
 from cdpipe.core.geometry.voxel import cell_means
 from cdpipe.core.threads import allowed_threads, in_threads
-from cdpipe.surface.cells import CELL_M, SurfaceCells
+from cdpipe.surface.cells import CELL_M, NearReturns, SurfaceCells
 
 _NEAREST = 80
 _LEAST_CELLS = 8
@@ -29,7 +29,7 @@ class SurfacePlaces:
         roughness_m: (Q,) standard deviation of the cells around it, off their plane.
         flatness: (Q,) the same, over the smaller spread within the plane: 0 a plane, 1 no surface at all.
         areas_m2: (Q,) area of the surface that each place stands for.
-        seen_from_m: (Q,) distance of each from the path of the before session.
+        seen_from_m: (Q,) distance of each from the nearest position of the before session that saw it.
     """
 
     points: Float64Array
@@ -44,14 +44,15 @@ class SurfacePlaces:
         return SurfacePlaces(*(getattr(self, each.name)[chosen] for each in fields(self)))
 
 
-def choose_places(before: SurfaceCells, path: Float64Array, spacing_m: float, normal_m: float) -> SurfacePlaces:
+def choose_places(before: SurfaceCells, returns: NearReturns, spacing_m: float, normal_m: float) -> SurfacePlaces:
     """Return the cell nearest to the mean of the cells of each voxel, where there are enough of them for a plane.
 
     A place stands for the area of a disc about it over the number of places within.
 
     Args:
         before: Cells of the before session.
-        path: (K, 3) positions of the sensor, map frame; normals point towards the nearest.
+        returns: What the cells were made from. Normals point towards the nearest position that saw the place: another
+            drift may be nearer, behind the rock.
         spacing_m: Edge of a voxel, metres.
         normal_m: Radius of the cells that the plane is fitted to, metres.
     """
@@ -64,16 +65,28 @@ def choose_places(before: SurfaceCells, path: Float64Array, spacing_m: float, no
         none = np.zeros(0)
         return SurfacePlaces(np.zeros((0, 3)), np.zeros((0, 3)), none, none, none, none)
     normals, spreads_m, counts = (np.concatenate(part) for part in zip(*parts, strict=True))
-    seen_from_m, nearest = cKDTree(path).query(points)
-    seen_from = path[nearest]
-    normals *= np.where(np.einsum("ij,ij->i", normals, seen_from - points) < 0, -1.0, 1.0)[:, None]
+    views = _nearest_views(before, returns, chosen) - points
+    seen_from_m = np.linalg.norm(views, axis=1)
+    normals *= np.where(np.einsum("ij,ij->i", normals, views) < 0, -1.0, 1.0)[:, None]
     kept = np.flatnonzero(counts >= _LEAST_CELLS)
     normals, spreads_m = normals[kept], spreads_m[kept]
     points, radius_m = points[kept], _DISC * spacing_m
     shares = cKDTree(points).query_ball_point(points, radius_m, return_length=True, workers=allowed_threads())
     areas_m2 = np.pi * radius_m**2 / np.asarray(shares, dtype=np.float64)
     flatness = spreads_m[:, 0] / np.maximum(spreads_m[:, 1], CELL_M / 2)
-    return SurfacePlaces(points, normals, spreads_m[:, 0], flatness, areas_m2, np.asarray(seen_from_m)[kept])
+    return SurfacePlaces(points, normals, spreads_m[:, 0], flatness, areas_m2, seen_from_m[kept])
+
+
+def _nearest_views(before: SurfaceCells, returns: NearReturns, chosen: Int64Array) -> Float64Array:
+    """Return the (Q, 3) position of the sensor nearest to each of the chosen cells, of those that saw it."""
+    place_of = np.full(int(returns.cell_of.max(initial=-1)) + 1, -1)
+    place_of[before.numbers[chosen]] = np.arange(len(chosen))
+    own = np.flatnonzero(place_of[returns.cell_of] >= 0)
+    place, path = place_of[returns.cell_of[own]], returns.map_T_sensor[:, :3, 3]
+    path_m = travelled_m(returns.map_T_sensor)
+    sensors = np.stack([np.interp(returns.path_m[own], path_m, each) for each in path.T], axis=1)
+    order = np.lexsort((np.linalg.norm(sensors - before.points[chosen[place]], axis=1), place))
+    return np.asarray(sensors[order[np.unique(place[order], return_index=True)[1]]])
 
 
 def _fit_planes(

@@ -7,11 +7,11 @@ import pytest
 
 from cdpipe.core.geometry import Float64Array, make_pose, stream, transform
 from cdpipe.model.config import load_config
-from cdpipe.surface.cells import NearReturns, SurfaceCells
+from cdpipe.surface.cells import NearReturns, SurfaceCells, make_cells
 from cdpipe.surface.measure import measure_planes
 from cdpipe.surface.method import Measured
 from cdpipe.surface.motions import PathMotions, fit_motions
-from cdpipe.surface.places import SurfacePlaces
+from cdpipe.surface.places import SurfacePlaces, choose_places
 from cdpipe.surface.regions import group_regions
 from cdpipe.surface.unrolled import unroll
 from tests.cdpipe.surface.tunnels import (
@@ -243,6 +243,26 @@ def test_averaging_leaves_the_part_of_the_level_that_neighbours_share(survey: Su
     assert len(group_regions(places, along_m, level_m, 0.25, 0.005, 0.75)[1]) == 1
     for shared_m in (0.025, np.full(len(level_m), 0.025)):
         assert group_regions(places, along_m, level_m, 0.25, 0.005, 0.75, shared_m=shared_m)[1] == ()
+
+
+def test_normals_point_to_where_the_rock_was_seen_from() -> None:
+    """A face that was seen from 3 m away, and another drift passes 1.5 m behind it."""
+    y_m, z_m = (each.ravel() for each in np.meshgrid(np.arange(-2.0, 2.0, 0.02), np.arange(0.0, 3.0, 0.02)))
+    points = np.column_stack([np.full(len(y_m), 3.0), y_m, z_m])
+    seen, behind = np.arange(-5.0, 0.1, 0.5), np.arange(-5.0, 5.1, 0.5)
+    path = np.concatenate([
+        np.column_stack([seen, np.zeros(len(seen)), np.ones(len(seen))]),
+        np.column_stack([np.full(len(behind), 4.5), behind, np.ones(len(behind))]),
+    ])  # fmt: skip
+    returns = single_returns(points, np.where(y_m > 0, 5.0, 4.0), np.ones(len(points)))
+    returns = replace(returns, map_T_sensor=make_pose(translation=path))
+    places = choose_places(make_cells(returns), returns, 0.25, 0.3)
+    assert len(places.points) > 100
+    np.testing.assert_allclose(places.normals[:, 0], -1.0, atol=1e-6)
+    sensors = np.where(places.points[:, 1] > 0, 0.0, -1.0)[:, None] * [1.0, 0.0, 0.0] + [0.0, 0.0, 1.0]
+    is_inner = np.abs(places.points[:, 1]) > 0.05
+    away_m = np.linalg.norm(places.points - sensors, axis=1)
+    np.testing.assert_allclose(places.seen_from_m[is_inner], away_m[is_inner], atol=1e-6)
 
 
 def test_the_places_cover_the_area_of_the_tunnel(survey: Survey) -> None:

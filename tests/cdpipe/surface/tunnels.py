@@ -58,7 +58,7 @@ def single_returns(points: Float64Array, path_m: Float64Array, weights: Float64A
 def surveyed(returns: NearReturns) -> tuple[SurfaceCells, SurfacePlaces, Float64Array]:
     """Cells, places and their chainage, as `measure_surface` makes them by default."""
     cells = make_cells(returns)
-    places = choose_places(cells, PATH[:, :3, 3], 0.25, 0.3)
+    places = choose_places(cells, returns, 0.25, 0.3)
     return cells, places, unroll(places.points, PATH)[0]
 
 
