@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
@@ -20,7 +21,9 @@ from types import MappingProxyType
 import numpy as np
 from scipy.spatial import cKDTree
 
+from cdpipe.core.errors import InputWarning
 from cdpipe.core.geometry import BoolArray, Float64Array
+from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.core.plugins import require_extra
 from cdpipe.core.threads import allowed_threads
 from cdpipe.model.config import PipelineConfig, SurfaceConfig
@@ -54,6 +57,9 @@ _SAMPLE, _ON_PLACE_M, _SCAN_WINDOW_M = 400_000, 0.2, 4.0
 _TILT_RAD, _CLOSE_M = 2e-3, 4.0
 # The variance of a mean from four folds is noisy: that of a place is the mean over its neighbours.
 _NEIGHBOURS = 8
+# Where less than that share of the occupied voxels has a displacement, and cells lie farther apart than that share of
+# the radius, the map is too thin: it needs a radius of that many times the distance. So many cells tell it.
+_MOST, _THIN, _WIDE, _SPACING_SAMPLE = 0.5, 0.6, 2.0, 20_000
 # Least share of the roughness that both spheres do not share, as standard deviation, and the least error of a mean.
 _ROUGHNESS, _LEAST_M = 0.18, 0.0004
 # Two means over few cells of one rough surface differ by that share of what they would if each session drew its cells
@@ -82,6 +88,7 @@ def measure_surface(
     after = near_returns(merged, "after")
     measured = load_method(settings.method)(cells, after, places, chainage_m, config)
     measured = _within_search(measured)
+    _warn_of_thin_maps((cells, measured.after), measured.displacement_m, settings)
     is_rock, is_of_object = split_rock(objects, places, measured.along_m, measured.level_m)
     along_m, displacement_m = (
         np.where(is_of_object, np.nan, values) for values in (measured.along_m, measured.displacement_m)
@@ -97,6 +104,31 @@ def measure_surface(
         places.points, places.normals, displacement_m, measured.level_m, region, regions, chainage_m, angle_deg
     )
     return field, is_rock, time.perf_counter() - start
+
+
+def _warn_of_thin_maps(
+    sessions: tuple[SurfaceCells, SurfaceCells | None], displacement_m: Float64Array, settings: SurfaceConfig
+) -> None:
+    """Warn where most of the before surface has no displacement, as the spheres hold too few cells of a thin map."""
+    n_occupied = len(np.unique(cell_keys(sessions[0].points, settings.spacing_m)))
+    if np.count_nonzero(np.isfinite(displacement_m)) >= _MOST * n_occupied:
+        return
+    apart_m = max(_spacing_m(each) for each in sessions if each is not None)
+    if apart_m > _THIN * settings.radius_m:
+        wide_m = np.ceil(20 * _WIDE * apart_m) / 20
+        text = (
+            f"most of the rock has no displacement: points are {apart_m:.2f} m apart, and surface.radius_m = "
+            f"{settings.radius_m:g} and surface.normal_m = {settings.normal_m:g} hold too few: "
+            f"--set surface.radius_m={wide_m:g} --set surface.normal_m={wide_m:g}"
+        )
+        warnings.warn(text, InputWarning, stacklevel=2)
+
+
+def _spacing_m(cells: SurfaceCells) -> float:
+    """Return the median distance of a cell to its nearest neighbour, metres; NaN of fewer than two cells."""
+    some = cells.points[:: max(len(cells.points) // _SPACING_SAMPLE, 1)]
+    found = cells.tree.query(some, k=[2], workers=allowed_threads())[0] if len(some) > 1 else np.full(1, np.nan)
+    return float(np.median(found))
 
 
 def _within_search(measured: Measured) -> Measured:

@@ -29,7 +29,7 @@ _BLOCK = 1 << 14
 # The after surface is searched along the normal in these steps, where none is at the place itself: into the void as far
 # as rubble, shotcrete and fill rise, and away from it as far as a face advances.
 _STEP_M, _INTO_VOID_M, _INTO_ROCK_M = 0.1, 1.5, 5.0
-_NEAR_M = 0.12
+_NEAR = 0.6  # a cell is near within that share of the radius of the spheres
 # Displacements beyond this are distances to the nearest cell of the after surface: at the flank of a heap the normal of
 # the floor is not that of the heap.
 _FAR_M = 0.1
@@ -79,7 +79,7 @@ def measure_offsets(
     along_m, variance_m2, own_m, sampling = (np.full(n, np.nan) for _ in range(4))
     if n == 0 or len(after.points) == 0:
         return Offsets(along_m, along_m.copy(), variance_m2, own_m, sampling)
-    start_m = _find_surface(after, places)
+    start_m = _find_surface(after, places, _NEAR * radius_m)
     for widening in _WIDENINGS:
         rest = np.flatnonzero(np.isfinite(start_m) & np.isnan(along_m))
         points, normals = places.points[rest], places.normals[rest]
@@ -97,24 +97,24 @@ def measure_offsets(
     return Offsets(along_m, nearest_m, variance_m2, own_m, sampling)
 
 
-def _find_surface(after: SurfaceCells, places: SurfacePlaces) -> Float64Array:
+def _find_surface(after: SurfaceCells, places: SurfacePlaces, near_m: float) -> Float64Array:
     """Return the (Q,) height along the normal at which the after surface is near; NaN where it is nowhere."""
-    start_m = np.where(_is_near(after, places.points), 0.0, np.nan)
+    start_m = np.where(_is_near(after, places.points, near_m), 0.0, np.nan)
     rest = np.flatnonzero(np.isnan(start_m))
     for step in range(1, int(_INTO_ROCK_M / _STEP_M) + 1):
         for height_m in (step * _STEP_M, -step * _STEP_M):
             if height_m > _INTO_VOID_M or len(rest) == 0:
                 continue
-            is_near = _is_near(after, places.points[rest] + height_m * places.normals[rest])
+            is_near = _is_near(after, places.points[rest] + height_m * places.normals[rest], near_m)
             start_m[rest[is_near]] = height_m
             rest = rest[~is_near]
     return start_m
 
 
-def _is_near(cells: SurfaceCells, points: Float64Array) -> BoolArray:
+def _is_near(cells: SurfaceCells, points: Float64Array, near_m: float) -> BoolArray:
     """Mark the (N, 3) points that have a cell nearby."""
-    distance_m, _ = cells.tree.query(points, distance_upper_bound=_NEAR_M, workers=allowed_threads())
-    return np.asarray(distance_m <= _NEAR_M)
+    distance_m, _ = cells.tree.query(points, distance_upper_bound=near_m, workers=allowed_threads())
+    return np.asarray(distance_m <= near_m)
 
 
 def _settle(

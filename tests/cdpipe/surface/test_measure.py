@@ -1,14 +1,17 @@
 """Our measure of displacement, on a smooth tunnel of which is known what moved."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from cdpipe.core.errors import InputWarning
 from cdpipe.core.geometry import Float64Array, make_pose, stream, transform
+from cdpipe.core.geometry.voxel import cell_means
 from cdpipe.model.config import load_config
 from cdpipe.surface.cells import NearReturns, SurfaceCells, make_cells
-from cdpipe.surface.measure import measure_planes
+from cdpipe.surface.measure import _warn_of_thin_maps, measure_planes
 from cdpipe.surface.method import Measured
 from cdpipe.surface.motions import PathMotions, fit_motions
 from cdpipe.surface.places import SurfacePlaces, choose_places
@@ -263,6 +266,31 @@ def test_normals_point_to_where_the_rock_was_seen_from() -> None:
     is_inner = np.abs(places.points[:, 1]) > 0.05
     away_m = np.linalg.norm(places.points - sensors, axis=1)
     np.testing.assert_allclose(places.seen_from_m[is_inner], away_m[is_inner], atol=1e-6)
+
+
+def test_thin_maps_are_warned_of_and_measured_with_larger_spheres() -> None:
+    def thinned(returns: NearReturns) -> NearReturns:
+        return single_returns(points := cell_means(returns.points, 0.25)[0], points[:, 0].clip(0.0, 11.0),
+                              np.ones(len(points)))  # fmt: skip
+
+    before, after = thinned(tunnel(1)), thinned(tunnel(2, lambda x_m, _: np.where(np.abs(x_m - 6.0) < 2.0, 0.03, 0.0)))
+    cells = make_cells(before)
+    for radius_m, is_thin in ((0.2, True), (0.5, False)):
+        config = load_config("tunnelcd", [f"surface.radius_m={radius_m}", f"surface.normal_m={max(radius_m, 0.3)}"])
+        places = choose_places(cells, before, 0.25, config.surface.normal_m)
+        found = measure_planes(cells, after, places, unroll(places.points, PATH)[0], config)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            _warn_of_thin_maps((cells, found.after), found.displacement_m, config.surface)
+        told = [str(each.message) for each in caught if each.category is InputWarning]
+        assert len(told) == is_thin
+        assert all("0.2" in text and "surface.radius_m=0." in text for text in told)
+        known = np.isfinite(found.displacement_m)
+        assert (np.count_nonzero(known) < 1000) == is_thin
+        if not is_thin:
+            assert known.mean() > 0.9
+            middle = np.abs(places.points[:, 0] - 6.0) < 1.0
+            assert np.nanmedian(found.displacement_m[middle]) == pytest.approx(0.03, abs=0.003)
 
 
 def test_the_places_cover_the_area_of_the_tunnel(survey: Survey) -> None:
