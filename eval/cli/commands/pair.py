@@ -76,7 +76,8 @@ def detect(
         typer.Option("--before-T-after", metavar="FILE", help="known merge, 4x4 as text or JSON", show_default=False),
     ] = None,
     surface: Annotated[
-        bool, typer.Option("--surface", help="measure how far the rock moved, too (surface.method=planes)")
+        bool,
+        typer.Option("--surface", help="measure how far the rock moved, too: surface.method=planes, unless it is set"),
     ] = False,
     html: Annotated[
         bool, typer.Option("--html", help="also write answer.html: the pair in 3-D and its objects, one offline page")
@@ -97,7 +98,7 @@ def detect(
     from eval.core.output import new_folder
 
     require_method_settings(settings)
-    settings = [*(["surface.method=planes"] if surface else []), *(settings or [])]
+    settings = _with_surface(preset, settings or [], site) if surface else settings or []
     config = cdpipe.load_config(preset, settings, site)
     known = _read_known_merge(before_T_after, assume_aligned=assume_aligned)
     hows = how_to_read(2, form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin)
@@ -124,6 +125,14 @@ def detect(
     files = ["answer.json", "answer.npz", "regions.csv", "objects.csv", "objects.ply"]
     files += [] if report.surface is None else ["surface.csv", "surface.ply", "surface.png"]
     print_answer(report, out, [*files, *(["answer.html"] if html else [])], config.query.threshold)
+
+
+def _with_surface(preset: str, settings: Sequence[str], site: KindOfSite) -> list[str]:
+    """Return settings that measure displacement: by `planes`, unless the preset or a setting names a method."""
+    import cdpipe
+
+    is_named = cdpipe.load_config(preset, settings, site).surface.method != "none"
+    return [*settings] if is_named else ["surface.method=planes", *settings]
 
 
 def _write_page(

@@ -19,6 +19,7 @@ from cdpipe.io.readers import open_session
 from cdpipe.model.config import DescriptorConfig
 from cdpipe.model.types import DescriptorSet, ScanSource
 from cdpipe.pipeline import mapping
+from eval.cli.commands.pair import _with_surface
 from eval.cli.main import main
 from eval.graft import making
 from eval.plans import cells as plan_cells
@@ -561,3 +562,11 @@ def test_programs_tell_mistakes_as_the_commands_do(
         runpy.run_module(f"eval.studies.{program}", run_name="__main__")
     out, err = capsys.readouterr()
     assert_refused((int(caught.value.code or 0), out, err), *words)
+
+
+def test_surface_keeps_the_method_that_a_preset_or_a_setting_names(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("surface: {method: c2c}\n")
+    assert _with_surface(str(mine), [], "narrow") == []
+    assert _with_surface("tunnelcd", ["surface.method=c2m"], "narrow") == ["surface.method=c2m"]
+    assert _with_surface("tunnelcd", [], "narrow") == ["surface.method=planes"]
