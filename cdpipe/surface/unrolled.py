@@ -39,10 +39,13 @@ def unroll(points: Float64Array, odom_T_sensor: Float64Array) -> tuple[Float64Ar
     return chainage_m, np.rad2deg(np.arctan2(left_m, up_m)), np.hypot(left_m, up_m)
 
 
-def middle_place(chainage_m: Float64Array, angle_deg: Float64Array) -> tuple[float, float]:
-    """Return the median of (N,) chainages, metres, and the mean direction of (N,) angles, degrees."""
-    turn = np.deg2rad(angle_deg)
-    return float(np.median(chainage_m)), float(np.rad2deg(np.arctan2(np.sin(turn).mean(), np.cos(turn).mean())))
+def middle_place(points: Float64Array, chainage_m: Float64Array, angle_deg: Float64Array) -> tuple[float, float]:
+    """Return chainage, metres, and angle, degrees, of that of (N, 3) places, N > 0, which is nearest to their mean.
+
+    Places that the path passes twice have two chainages: what lies between names another place.
+    """
+    nearest = int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))
+    return float(chainage_m[nearest]), float(angle_deg[nearest])
 
 
 def _middles(values: Float64Array, group: Int64Array) -> Float64Array:

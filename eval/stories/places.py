@@ -120,7 +120,9 @@ def _measure(surface: SurfaceField | None, point: Float64Array) -> dict[str, flo
     found |= {"n_points": len(rows), "displacement_m": moved_m, "level_m": level_m}
     found["is_beyond_level"] = abs(moved_m) > level_m
     if surface.chainage_m is not None and surface.angle_deg is not None:
-        chainage_m, angle_deg = middle_place(surface.chainage_m[rows], surface.angle_deg[rows])
+        chainage_m, angle_deg = middle_place(
+            surface.points_map[rows], surface.chainage_m[rows], surface.angle_deg[rows]
+        )
         found |= {"chainage_m": chainage_m, "angle_deg": angle_deg}
     return found
 

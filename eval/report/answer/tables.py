@@ -49,8 +49,8 @@ def tabulate_rock(surface: SurfaceField) -> pd.DataFrame:
     for number, item in enumerate(surface.regions):
         own = surface.region == number
         places = np.nan, np.nan
-        if surface.chainage_m is not None and surface.angle_deg is not None:
-            places = middle_place(surface.chainage_m[own], surface.angle_deg[own])
+        if own.any() and surface.chainage_m is not None and surface.angle_deg is not None:
+            places = middle_place(surface.points_map[own], surface.chainage_m[own], surface.angle_deg[own])
         sizes = item.area_m2, 1000 * item.mean_m, 1000 * item.largest_m, item.volume_m3
         rows.append((number, *places, *sizes))
     return pd.DataFrame(rows, columns=columns)

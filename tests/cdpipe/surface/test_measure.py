@@ -16,7 +16,7 @@ from cdpipe.surface.method import Measured
 from cdpipe.surface.motions import PathMotions, fit_motions
 from cdpipe.surface.places import SurfacePlaces, choose_places
 from cdpipe.surface.regions import group_regions
-from cdpipe.surface.unrolled import unroll
+from cdpipe.surface.unrolled import middle_place, unroll
 from tests.cdpipe.surface.tunnels import (
     LENGTH_M,
     PATH,
@@ -202,6 +202,16 @@ def test_a_path_that_comes_back_counts_on() -> None:
     assert chainage_m[0] == pytest.approx(4.3, abs=1e-6)
     assert chainage_m[1] == pytest.approx(2 * (LENGTH_M - 0.25) + 1.0 - 4.3, abs=1e-6)
     assert unroll(np.zeros((0, 3)), PATH)[0].shape == (0,)
+
+
+def test_a_region_that_two_passes_share_has_the_place_of_its_middle() -> None:
+    beside = make_pose(translation=np.array([0.0, -1.0, 0.0])) @ PATH[::-1]
+    y_m, x_m = (each.ravel() for each in np.meshgrid(np.arange(-1.4, 0.5, 0.1), np.arange(3.0, 5.0, 0.1)))
+    roof = np.column_stack([x_m, y_m, np.full(len(x_m), RADIUS_M)])
+    chainage_m, angle_deg, _ = unroll(roof, np.concatenate([PATH, beside]))
+    middle_m = middle_place(roof, chainage_m, angle_deg)[0]
+    # 4 m on the way there is 20.5 m on the way back; the median of both names neither
+    assert min(abs(middle_m - 4.0), abs(middle_m - (2 * (LENGTH_M - 0.25) + 1.0 - 4.0))) < 0.2
 
 
 def test_areas_and_volumes_of_regions(survey: Survey) -> None:
