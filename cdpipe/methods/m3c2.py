@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 import os
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -133,7 +134,8 @@ def compare_clouds(
 
 def load_py4dgeo() -> Any:
     """Return the module py4dgeo, silent and held to one thread."""
-    import py4dgeo
+    with warnings.catch_warnings():  # its import silences every warning of the process
+        import py4dgeo
 
     # it logs to standard output and into a file in the working folder
     logging.getLogger("py4dgeo").setLevel(logging.CRITICAL)

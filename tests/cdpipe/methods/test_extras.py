@@ -2,6 +2,8 @@
 
 import importlib.util
 import logging
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -202,6 +204,13 @@ def test_m3c2_leaves_no_log(empty: PointMap, caplog: pytest.LogCaptureFixture) -
 
 
 @needs("dufomap")
+def test_m3c2_silences_no_warning_of_others() -> None:
+    pytest.importorskip("py4dgeo")
+    asked = "('ignore', None, Warning, None, 0) in warnings.filters"
+    code = f"import warnings; from cdpipe.methods.m3c2 import load_py4dgeo; load_py4dgeo(); print({asked})"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
+
+
 def test_dufomap_by_hand(empty: PointMap) -> None:
     """The room ends at x = 5: void in front of that wall, but not behind it, nor within the inflation of its hits."""
     x_m = np.array([0.0, 3.0, 4.45, 4.95, 5.3, 5.9])
