@@ -29,7 +29,8 @@ class SurfacePlaces:
         roughness_m: (Q,) standard deviation of the cells around it, off their plane.
         flatness: (Q,) the same, over the smaller spread within the plane: 0 a plane, 1 no surface at all.
         areas_m2: (Q,) area of the surface that each place stands for.
-        seen_from_m: (Q,) distance of each from the nearest position of the before session that saw it.
+        seen_from_m: (Q,) distance of each from the path of the before session; where its nearest position lies behind
+            the rock, from the nearest one that saw the place.
     """
 
     points: Float64Array
@@ -66,8 +67,11 @@ def choose_places(before: SurfaceCells, returns: NearReturns, spacing_m: float, 
         return SurfacePlaces(np.zeros((0, 3)), np.zeros((0, 3)), none, none, none, none)
     normals, spreads_m, counts = (np.concatenate(part) for part in zip(*parts, strict=True))
     views = _nearest_views(before, returns, chosen) - points
-    seen_from_m = np.linalg.norm(views, axis=1)
     normals *= np.where(np.einsum("ij,ij->i", normals, views) < 0, -1.0, 1.0)[:, None]
+    path = before.map_T_sensor[:, :3, 3]
+    from_path_m, nearest = cKDTree(path).query(points)
+    is_behind = np.einsum("ij,ij->i", normals, path[nearest] - points) < 0
+    seen_from_m = np.where(is_behind, np.linalg.norm(views, axis=1), from_path_m)
     kept = np.flatnonzero(counts >= _LEAST_CELLS)
     normals, spreads_m = normals[kept], spreads_m[kept]
     points, radius_m = points[kept], _DISC * spacing_m
