@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array, transform
 from cdpipe.io.session import Session, read_session
-from scenarios.schema import Odometry, Place, Prop, Scenario, SessionPlan
+from scenarios.schema import Odometry, Place, Prop, Scenario, Sensor, SessionPlan
 from sim.scene import build_world
 from sim.session import simulate
 from sim.session.simulate import simulate_pair
@@ -96,17 +96,19 @@ def test_short_chunks_hold_the_same_session(
         np.testing.assert_array_equal(labels, next(read_labels(whole.path, 1)))
 
 
-def test_labels_match_what_is_where(scenario: Scenario, pair: Path) -> None:
-    world = build_world(scenario, SEED)
+def test_labels_match_what_is_where(scenario: Scenario, tmp_path: Path) -> None:
+    exact = scenario.model_copy(update={"sensor": Sensor(range_noise=False)})
+    simulate_pair(exact, SEED, tmp_path / "pair")
+    world = build_world(exact, SEED)
     for name in ("before", "after"):
-        points, labels = returns_in_world(read_session(pair / name))
+        points, labels = returns_in_world(read_session(tmp_path / "pair" / name))
         standing = [item for item in world.standing if name in item.sessions]
         assert set(np.unique(labels[:, 0])) - {-2} == {0} | {scenario.props.index(item.prop) + 1 for item in standing}
         for item in standing:
             instance = scenario.props.index(item.prop) + 1
             local = transform(np.linalg.inv(item.world_T_object), points)
             half = np.array(item.prop.size_m) / (2, 2, 1)
-            slack = 0.06 if item.prop.kind != "muck_pile" else 0.35  # noise of 1 cm; a heap's outline wanders
+            slack = 0.002 if item.prop.kind != "muck_pile" else 0.35  # whole millimetres; a heap's outline wanders
             is_inside = (np.abs(local[:, :2]) < half[:2] + slack).all(axis=1) & (local[:, 2] < half[2] + slack)
             own = labels[:, 0] == instance
             assert own.sum() > 100
