@@ -1,36 +1,20 @@
-"""Returns of mist and dust: told by their weakness, and by neighbours that do not lie on one surface with them.
-
-A surface within a few metres sends back tens of photons, the air in front of it a handful; and the places from which
-air returns are scattered along the beams, while neighbouring beams meet a surface at ranges that agree or follow a
-line. Published filters for snow use either: intensity (LIOR, Park and others 2020) and local density (DROR, Charron and
-others 2018).
-"""
+"""A session without the returns of mist and dust (`cdpipe.sensor.air` tells them), but for those on its surfaces."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, transform
 from cdpipe.core.geometry.voxel import cell_corners, cell_keys
 from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PointMap, PosedScan, ScanSource, WrappedScans
+from cdpipe.sensor.air import find_airborne
 
-# Simulated validation worlds (10001 of six families). A scan is dusty by the first rule: it holds for 0.4 % of a clear
-# scan at most, for 94 % and more of the returns of mist and dust. In a dusty scan the second rule drops what it can: in
-# mist with 12, 20 and 40 m of visibility 0.8, 0.01 and 0.00 % of what is left are returns of the mist, and 9, 6 and 4 %
-# of the surfaces are lost.
-_FARTHEST_M = 20.0
-# Too dark for a surface: fewer photons than this within such a range. Mist of 12 m of visibility lies so near to the
-# sensor that neighbours agree (`dust/mist` 10013): 99 % of its returns within 1 m have 17 photons at most, rock behind
-# as much of it 14 and more.
-_DARK = ((1.0, 16), (3.0, 10))
-_DUSTY_SHARE = 0.01
 # What looks airborne is on a surface if it lies this near to the mean of the other returns of a cell, if that and the
 # cells around it hold so many of them. In the dust of `dust/narrow` 10001 objects lose two thirds of their returns
 # otherwise (object IoU 0.34). Of `dust/mist` 10013 and 10015 and `dust/wide` 10012, 0.94, 0.97 and 0.75 of the dropped
@@ -38,21 +22,6 @@ _DUSTY_SHARE = 0.01
 # 0.87, 0.79 and 0.50 did with as much. With cells of 0.2 m mist near a floor passes for it.
 _SURFACE_CELL_M, _SURFACE_RETURNS, _SURFACE_M = 0.1, 9, 0.08
 _BLOCK_RETURNS = 1 << 22
-
-
-@dataclass(frozen=True, slots=True)
-class _Rule:
-    """A return is airborne if it is weak and fewer than two of its four neighbours agree with its range."""
-
-    weak_photons: int
-    agree_m: float
-    agree_share: float
-    may_lie_between: bool  # whether it may instead lie on the line between the next two
-
-
-_IN_ANY_AIR = _Rule(16, 0.1, 0.02, may_lie_between=True)
-_IN_DUST = _Rule(24, 0.05, 0.01, may_lie_between=False)
-
 
 LiesOnSurface = Callable[[PosedScan, Int64Array], BoolArray]
 
@@ -150,42 +119,12 @@ def drop_airborne(scan: PosedScan, lies_on_surface: LiesOnSurface | None = None)
     """
     if scan.signal is None:
         return scan
-    if np.count_nonzero(_mark(scan, scan.signal, _IN_ANY_AIR)) <= _DUSTY_SHARE * len(scan.pixels):
+    ranges_m = np.sqrt(np.einsum("ij,ij->i", scan.points_sensor, scan.points_sensor))
+    is_airborne = find_airborne(ranges_m, scan.signal, scan.pixels, scan.second_from)
+    if is_airborne is None:
         return scan
-    kept = ~_mark(scan, scan.signal, _IN_DUST)
-    if not kept.any():
-        return scan
+    kept = ~is_airborne
     if lies_on_surface is not None:
-        marked = np.flatnonzero(~kept)
+        marked = np.flatnonzero(is_airborne)
         kept[marked[lies_on_surface(scan, marked)]] = True
     return replace(scan.keep(kept), airborne_sensor=scan.points_sensor[~kept])
-
-
-def _mark(scan: PosedScan, signal: npt.NDArray[np.uint16], rule: _Rule) -> BoolArray:
-    """Mark the (N,) returns within 20 m that look airborne by a rule, and those too dark for a surface."""
-    squared_m2 = np.einsum("ij,ij->i", scan.points_sensor, scan.points_sensor)
-    is_marked: BoolArray = (signal < rule.weak_photons) & (squared_m2 < _FARTHEST_M**2)
-    weak = np.flatnonzero(is_marked)
-    ranges_m = np.sqrt(squared_m2)
-    is_dark = [(ranges_m[weak] < near_m) & (signal[weak] < photons) for near_m, photons in _DARK]
-    is_marked[weak] = np.logical_or(*is_dark) | ~_is_on_surface(scan, ranges_m, weak, rule)
-    return is_marked
-
-
-def _is_on_surface(scan: PosedScan, ranges_m: Float64Array, chosen: Int64Array, rule: _Rule) -> BoolArray:
-    """Tell which (C,) chosen returns lie on one surface with the two beams on either side in their row.
-
-    Of a beam with two returns either one may agree.
-    """
-    n_beams = scan.second_from or int(scan.pixels.max(initial=0)) + 1
-    images = np.full((1 if scan.second_from is None else 2, n_beams + 4), np.nan)
-    number, beam = np.divmod(scan.pixels, n_beams)
-    images[number, beam + 2] = ranges_m
-    own, at = ranges_m[chosen], beam[chosen] + 2
-    tolerance_m = rule.agree_m + rule.agree_share * own
-    around = {step: images[:, at + step] for step in (-2, -1, 1, 2)}
-    agreeing = np.stack([(np.abs(other - own) < tolerance_m).any(axis=0) for other in around.values()])
-    is_on: BoolArray = agreeing.sum(axis=0) >= 2
-    if rule.may_lie_between:
-        is_on |= (np.abs(around[-1][:, None] + around[1][None] - 2 * own) < tolerance_m).any(axis=(0, 1))
-    return is_on

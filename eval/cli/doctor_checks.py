@@ -124,8 +124,10 @@ def odometry(name: str = "kiss-icp") -> str:
     from cdpipe.sensor.ouster import load_profile
 
     sensor = load_profile("os1-32-nominal", "512x10")
-    images = [np.full((sensor.height, 512), 5000, dtype=np.uint32)] * 3
-    motion = estimate_motion(images, sensor, np.array([0.0, 0.1, 0.2]), np.arange(512) / 5120.0 - 0.05, np.eye(4), name)
+    image = np.full((sensor.height, 512), 5000, dtype=np.uint32), np.zeros((sensor.height, 512), dtype=np.uint16)
+    motion = estimate_motion(
+        [image] * 3, sensor, np.array([0.0, 0.1, 0.2]), np.arange(512) / 5120.0 - 0.05, np.eye(4), name
+    )
     off_m = float(np.abs(motion.points).max())
     _require(off_m < 0.01, f"a sensor that stood still was moved by {off_m:.3f} m")
     return "finds no motion of a sensor that stands still"

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
@@ -14,7 +13,7 @@ from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array, Int64Array, stream
 from cdpipe.core.geometry.motion import Motion, make_motion
 from cdpipe.io.tum import motion_beyond, read_trajectory
-from cdpipe.mapping.poses.odometry import estimate_motion
+from cdpipe.mapping.poses.odometry import Image, estimate_motion
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Odometry
 
@@ -197,7 +196,7 @@ def read_odometry(
 
 
 def register_scans(
-    range_images: Iterable[npt.NDArray[np.uint32]],
+    revolutions: Iterable[Image],
     sensor: SensorMetadata,
     revolution_s: Float64Array,
     column_s: Float64Array,
@@ -210,7 +209,7 @@ def register_scans(
         ScenarioError: A pose is not finite; the message names the session.
     """
     try:
-        return estimate_motion(range_images, sensor, revolution_s, column_s, odom_T_first)
+        return estimate_motion(revolutions, sensor, revolution_s, column_s, odom_T_first)
     except InputError as error:
         raise ScenarioError(
             f"{session}: {error}: give another odometry.source, or a smaller platform.scan_spacing_m"

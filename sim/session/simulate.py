@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float32Array, Float64Array
@@ -23,6 +22,7 @@ from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.core.spooled import SpooledArray
 from cdpipe.core.yamlfile import setting_lines
 from cdpipe.io.session import CHUNK_SCANS, ScanChunk, Session, SessionWriter, fit_chunk
+from cdpipe.mapping.poses.odometry import Image
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
@@ -226,7 +226,7 @@ def _estimate_odometry(
     channels = {name: SpooledArray(dtype, shape, _HELD_BYTES) for name, dtype in kinds.items()}
     ghost_rays, sightings = [], []
 
-    def keep() -> Iterator[npt.NDArray[np.uint32]]:
+    def keep() -> Iterator[Image]:
         for number, revolution in enumerate(revolutions):
             if number % CHUNK_SCANS == 0:
                 report(f"odometry {drive.session}", number, trajectory.n_scans)
@@ -234,7 +234,7 @@ def _estimate_odometry(
                 spooled.append(getattr(revolution, name))
             ghost_rays.append(revolution.ghost_rays)
             sightings.append(revolution.sightings)
-            yield revolution.range_mm
+            yield revolution.range_mm, revolution.signal
         report(f"odometry {drive.session}", trajectory.n_scans, trajectory.n_scans)
 
     start = start_pose(trajectory.true, float(trajectory.revolution_s[0]))

@@ -18,7 +18,6 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError
@@ -31,7 +30,7 @@ from cdpipe.io.ouster.beams import check_beams
 from cdpipe.io.ouster.captures import Recording, Revolution, open_recording
 from cdpipe.io.session import ScanChunk, SessionWriter, fit_chunk
 from cdpipe.io.tum import motion_along
-from cdpipe.mapping.poses.odometry import ODOMETRIES, estimate_motion
+from cdpipe.mapping.poses.odometry import ODOMETRIES, Image, estimate_motion
 
 KISS_ICP = "kiss-icp"
 _OWN_POSE_TOLERANCE = 1e-9
@@ -154,7 +153,7 @@ def _choose_motion(
     if odometry is not None:
         offsets_ns = recording.sensor.column_offsets_ns()
         column_s = (offsets_ns - offsets_ns[len(offsets_ns) // 2]) / 1e9
-        images = _range_images(recording, len(times.first_ns), report)
+        images = _images(recording, len(times.first_ns), report)
         try:
             middle_s = (times.middle_ns - start_ns) / 1e9
             return estimate_motion(images, recording.sensor, middle_s, column_s, make_pose(), odometry), odometry
@@ -194,10 +193,10 @@ def _pose_rows(trajectory: Path, times: _Times) -> Float64Array | None:
     return np.column_stack([stamps_s, found.poses[:, :3, 3], quaternions])
 
 
-def _range_images(recording: Recording, n_scans: int, report: Progress) -> Iterator[npt.NDArray[np.uint32]]:
+def _images(recording: Recording, n_scans: int, report: Progress) -> Iterator[Image]:
     for number, revolution in enumerate(recording.revolutions()):
         report("odometry", number, n_scans)
-        yield revolution.range_mm
+        yield revolution.range_mm, revolution.signal
     report("odometry", n_scans, n_scans)
 
 

@@ -18,6 +18,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, invert, travelled_m
 from cdpipe.core.geometry.motion import Motion, make_motion, rotation_matrices
 from cdpipe.core.isolation import run_isolated
+from cdpipe.sensor.air import find_clear_pixels
 from cdpipe.sensor.ouster import SensorMetadata
 
 # Smaller than KISS-ICP's defaults, which are for streets: a drift is 4 to 9 m wide.
@@ -31,6 +32,7 @@ _CONVERGED = 1e-4
 # Name of an odometry -> the extra that installs it.
 ODOMETRIES = {"kiss-icp": "odometry", "genz-icp": "genz"}
 _GENZ = "genz-icp"
+Image = tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint16]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +49,7 @@ class _Frame:
 
 
 def estimate_motion(
-    range_images: Iterable[npt.NDArray[np.uint32]],
+    revolutions: Iterable[Image],
     sensor: SensorMetadata,
     revolution_s: Float64Array,
     column_s: Float64Array,
@@ -58,9 +60,12 @@ def estimate_motion(
 
     Each revolution is first deskewed to its middle column at the velocity of the preceding step. The odometry's own
     deskewing is off, because it assumes revolutions without gaps. A single revolution gives a motion at rest.
+    Returns of mist and dust are left out (`cdpipe.sensor.air`): they travel with the sensor, so it would seem to
+    stand.
 
     Args:
-        range_images: For each revolution the staggered ranges (R, W), millimetres, R as in a session, 0 for a miss.
+        revolutions: For each the staggered ranges (R, W), millimetres, R as in a session, 0 for a miss, and the
+            signal (R, W), photons, all 0 if there is none.
         sensor: Beam table.
         revolution_s: (S,) time of each middle column.
         column_s: (W,) time of each column after the middle one.
@@ -70,7 +75,10 @@ def estimate_motion(
     Raises:
         InputError: A pose is not finite.
     """
-    frames = (_columns_frame(sensor.project(range_mm / 1000.0), range_mm > 0, column_s) for range_mm in range_images)
+    frames = (
+        _columns_frame(sensor.project(range_mm / 1000.0), _is_clear(range_mm, signal, sensor), column_s)
+        for range_mm, signal in revolutions
+    )
     poses = _register(frames, revolution_s, "revolution", odometry)
     odom_T_sensor = odom_T_first @ poses
     if len(odom_T_sensor) == 1:
@@ -95,6 +103,10 @@ def estimate_cloud_motion(
         InputError: A pose is not finite.
     """
     return _register((cloud_frame(points, time_s) for points, time_s in clouds), stamps_s, "scan", odometry)
+
+
+def _is_clear(range_mm: npt.NDArray[np.uint32], signal: npt.NDArray[np.uint16], sensor: SensorMetadata) -> BoolArray:
+    return find_clear_pixels(range_mm, signal, range_mm.size // 2 if len(range_mm) == 2 * sensor.height else None)
 
 
 def _columns_frame(points: Float64Array, is_hit: BoolArray, column_s: Float64Array) -> _Frame:

@@ -135,10 +135,11 @@ def test_scans_are_cast_once_and_everything_that_is_measured_stands_where_kiss_i
     assert session.n_scans > 20 and session.n_scans % 7
     assert sorted(cast) == sorted((each.name, number) for each in drives for number in range(each.trajectory.n_scans))
     # register the written scans, then measure with these poses
-    drive, range_mm = drives[0], np.concatenate([chunk.range_mm for chunk in session.chunks()])
+    drive = drives[0]
+    images = [image for chunk in session.chunks() for image in zip(chunk.range_mm, chunk.signal, strict=True)]
     times = drive.trajectory.revolution_s, drive.trajectory.column_s
     start = start_pose(drive.trajectory.true, times[0][0])
-    estimated = register_scans(range_mm, session.sensor, *times, start, "before")
+    estimated = register_scans(images, session.sensor, *times, start, "before")
     drive = replace(drive, trajectory=replace(drive.trajectory, estimated=estimated))
     np.testing.assert_array_equal(session.odom_T_sensor, drive.trajectory.odom_T_sensor)
     column_poses = np.concatenate([chunk.column_poses for chunk in session.chunks()])
@@ -149,7 +150,7 @@ def test_scans_are_cast_once_and_everything_that_is_measured_stands_where_kiss_i
         is_on_it = change == wanted.id if is_own else instance == wanted.instance
         assert is_own == is_on_it.any()
         points = [
-            measured_points(drive, number, range_mm[number], *np.nonzero(on)) for number, on in enumerate(is_on_it)
+            measured_points(drive, number, images[number][0], *np.nonzero(on)) for number, on in enumerate(is_on_it)
         ]
         n_cells = len(np.unique(cell_keys(np.concatenate(points), CELL_M)))
         assert (wanted.n_cells if is_own else wanted.n_cells_other) == n_cells
@@ -236,7 +237,7 @@ def test_one_revolution_has_the_first_pose_and_an_empty_one_gives_a_finite_pose(
     column_s = (np.arange(sensor.width) - sensor.width // 2) / sensor.width / 10
     start = make_pose(Rotation.from_euler("y", 0.1).as_matrix())
     empty = np.zeros((sensor.height, sensor.width), np.uint32)
-    motion = register_scans([empty], sensor, np.array([0.05]), column_s, start, "before")
+    motion = register_scans([(empty, empty.astype(np.uint16))], sensor, np.array([0.05]), column_s, start, "before")
     np.testing.assert_allclose(motion.poses(np.array([0.0, 0.05, 0.1])), np.tile(start, (3, 1, 1)), atol=1e-12)
 
 
@@ -248,7 +249,8 @@ def test_a_pose_that_is_not_finite_is_an_error(sensor: SensorMetadata, monkeypat
             pass
 
     monkeypatch.setattr(odometry, "_kiss_icp", Lost)
-    scans = [np.full((sensor.height, sensor.width), 4000, np.uint32)] * 2
+    range_mm = np.full((sensor.height, sensor.width), 4000, np.uint32)
+    scans = [(range_mm, range_mm.astype(np.uint16))] * 2
     with pytest.raises(ScenarioError, match=r"after: KISS-ICP .*revolution 0"):
         register_scans(scans, sensor, np.array([0.05, 0.15]), np.zeros(sensor.width), np.eye(4), "after")
 
