@@ -107,6 +107,11 @@ def list_extras(
 
 
 @cache
+def _make(name: str) -> Any:
+    found = load_entry_point(METHODS, name)
+    return found() if isinstance(found, type) else found
+
+
 def load_method(name: str) -> Method:
     """Return what is registered under a name; a class is created at the first call.
 
@@ -116,8 +121,7 @@ def load_method(name: str) -> Method:
     """
     if name in PACKAGES:
         require_extra(_EXTRAS.get(name, name), f"regions.source = {name}")
-    found: Any = load_entry_point(METHODS, name)
-    made = found() if isinstance(found, type) else found
+    made = _make(name)
     propose = getattr(made, "propose", None)
     detect = None if propose is not None else getattr(made, "detect", made)
     if not callable(propose or detect):

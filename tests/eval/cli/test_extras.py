@@ -18,7 +18,6 @@ def test_a_missing_extra_is_named_before_anything_is_mapped(
 ) -> None:
     monkeypatch.setattr("cdpipe.core.plugins.find_spec", lambda name: None)
     monkeypatch.delattr(mapping, "build_map")
-    load_method.cache_clear()  # as in a new process
     folders = (tiny_pair / "before", tiny_pair / "after", "--preset", method, "--out", tmp_path / "out")
     code, out, err = command("detect", *folders)
     assert code == 2
