@@ -234,7 +234,8 @@ def require_weights_are_read(config: PipelineConfig) -> None:
     for section, reader, weights in sections:
         if weights and source != reader:
             raise InputError(
-                f"{section}.weights = {weights}: regions.source = {source} does not read them: expected {reader}"
+                f"{section}.weights = {weights}: regions.source = {source} does not read them: leave them out, or "
+                f"set regions.source={reader}"
             )
 
 
