@@ -218,11 +218,12 @@ def _name_kind(score_radius_m: float) -> str:
 
 
 def _find_lowest_examined(regions: pd.DataFrame) -> float | None:
-    """Return the lowest score that was examined; None for a method that withdraws nothing."""
+    """Return the lowest score that was withdrawn, so examined; None for a method that withdraws nothing.
+
+    Reported regions do not tell: one that an object was followed to is reported whatever its score.
+    """
     is_withdrawn = regions["is_withdrawn"].astype(bool)
-    if not is_withdrawn.any():
-        return None
-    return float(regions.loc[is_withdrawn | regions["is_reported"].astype(bool), "score"].min())
+    return float(regions.loc[is_withdrawn, "score"].min()) if is_withdrawn.any() else None
 
 
 def _round_above(scores: Float64Array, allowed: int, lowest: float | None) -> float:

@@ -102,7 +102,7 @@ def test_a_preset_that_tells_no_sites_apart_has_one_threshold_of_all_pairs() -> 
 
 def test_what_was_withdrawn_cannot_alarm() -> None:
     regions = _regions()
-    regions.loc[regions["score"] == 6.0, ["is_reported", "is_withdrawn"]] = False, True
+    regions.loc[regions["score"].isin([6.0, 4.0]), ["is_reported", "is_withdrawn"]] = False, True
     narrow, wide = find_thresholds(_results(), regions).to_dict("records")
     assert narrow["threshold"] == pytest.approx(5.001)
     assert wide["threshold"] == pytest.approx(200.1)
@@ -120,6 +120,16 @@ def test_no_threshold_is_below_what_was_looked_at() -> None:
     assert find_alarm_threshold(np.full(5, -np.inf), lowest=-6.905) == -6.905
     assert find_alarm_threshold(np.array([-7.0, -2.5]), lowest=-6.905) == pytest.approx(-2.499)
     assert find_alarm_threshold(np.full(40, -8.0), lowest=-6.905) == -6.905
+
+
+def test_a_region_to_which_an_object_was_followed_tells_nothing_of_what_was_looked_at() -> None:
+    # all down to 4 was withdrawn; the one of 3 stands, but its object was found from another region
+    regions = _regions()
+    is_narrow = regions["scenario"] != "null/c"
+    regions.loc[is_narrow, "is_withdrawn"] = regions.loc[is_narrow, "is_reported"]
+    regions.loc[is_narrow, "is_reported"] = ~regions.loc[is_narrow, "is_reported"]
+    narrow = find_thresholds(_results(), regions).iloc[0]
+    assert (narrow["threshold"], narrow["threshold_at_rate"]) == (4.0, 4.0)
 
 
 def test_what_is_looked_at_at_every_threshold_is_silenced_by_none() -> None:
