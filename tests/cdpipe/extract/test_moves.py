@@ -1,4 +1,5 @@
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -346,3 +347,13 @@ def test_an_object_of_which_one_session_saw_a_part_is_the_whole_one() -> None:
     small = tall[tall[:, 2] < 0.35]
     assert moves([noisy(tall, "a")], [noisy(shifted(small, 8.0), "b")]) == []
     assert moves([noisy(tall, "a")], [noisy(shifted(box((0.5, 0.4, 0.5), "lrfb"), 8.0), "b")]) == []
+
+
+def test_a_chair_seen_from_another_side_went_near_and_not_to_where_an_equal_one_came() -> None:
+    # `regions/site1` 10040, centimetres: a chair that went 4.6 m and was turned by 165 degrees, and one that came 79 m
+    # away and was seen from the side from which the former had been seen
+    chairs = {name: cm / 100.0 for name, cm in np.load(Path(__file__).with_name("chairs.npz")).items()}
+    for order in (("moved", "added"), ("added", "moved")):
+        (move,) = moves([chairs["removed"]], [chairs[name] for name in order])
+        assert order[move.added] == "moved"
+        assert np.linalg.norm(move.displacement_map) == pytest.approx(4.61, abs=0.1)
