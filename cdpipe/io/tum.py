@@ -32,7 +32,7 @@ def read_tum(path: Path) -> tuple[Float64Array, tuple[int, ...]]:
     """
     content = read_bytes(path, MOST_BYTES)
     try:
-        lines = content.decode().splitlines()
+        lines = content.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read as text: {error}") from error
     numbers = tuple(n for n, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith("#"))

@@ -51,6 +51,14 @@ def write_rows(path: Path, frame: pd.DataFrame) -> None:
     write_parquet(path, frame)
 
 
+def replace_table(new: Path, path: Path) -> None:
+    """Let a table, NAME.csv and its Parquet, take the place of another one on the same disk."""
+    write_parquet(path, pd.DataFrame())  # none stands beside another CSV
+    new.replace(path)
+    if parquet_folder(new).is_dir():
+        parquet_folder(new).replace(parquet_folder(path))
+
+
 def read_table(path: Path) -> pd.DataFrame:
     """Read a table, NAME.csv, NAME.csv.xz or NAME.parquet; one without a column gives an empty frame.
 

@@ -17,6 +17,7 @@ from eval.core.statistics import interval_over_tunnels, mean, median, statistic_
 from eval.core.terminal.printing import count_pairs
 from eval.leaderboard.calls import list_merges
 from eval.leaderboard.reference import take_other_methods
+from eval.plans.splits import version_name
 from eval.report.comparing.columns import COMPARED, figures_of, is_time
 from eval.report.comparing.differences import NOT_JUDGED, paired_differences, verdict
 from eval.report.render import write_file
@@ -252,7 +253,12 @@ def note_other_worlds(results: pd.DataFrame, references: Sequence[RunData]) -> I
 def _why_none(data: RunData, own: pd.DataFrame) -> str:
     plan = data.provenance.get("plan")
     split = str(plan.get("split", "")) if isinstance(plan, Mapping) else ""
-    seeds = "of split sealed: evaluate with --split sealed" if split.startswith("sealed") else "of other seeds"
+    version = split.removeprefix("sealed by ")
+    seeds = f"of split sealed of {version}" if version != split else "of other seeds"
+    if version == version_name():
+        seeds += ": evaluate with --split sealed"
+    elif version != split:
+        seeds += f", and this is {version_name()}: evaluate with that version and --split sealed"
     return f"{data.folder.path} holds none of these {len(own)} pairs; its pairs are {seeds}"
 
 

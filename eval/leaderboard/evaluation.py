@@ -239,9 +239,10 @@ def _call(run: RunFolder, method: Method, pair: Pair, opened: tuple[PairStages, 
     with _places() as places:
         try:
             write_merge(places["merge"], method.merge, *opened)
-        except MergeFailedError as refusal:
-            write_failure(answer, method.name, "merge_refused", str(refusal), refusal.evidence, {})
-            return CallFile(pair_digest=known, seconds=0.0, error=str(refusal), stderr="")
+        except (MergeFailedError, InputError) as reason:
+            told = ("merge_refused", reason.evidence) if isinstance(reason, MergeFailedError) else ("failed", {})
+            write_failure(answer, method.name, told[0], str(reason), told[1], {})
+            return CallFile(pair_digest=known, seconds=0.0, error=str(reason)[:_MOST_ERROR], stderr="")
         copy_pair(original, places["before"].parent)
         ended = run_command(method.command, places, places["work"], method.limit_s)
         error = ended.error

@@ -1,4 +1,4 @@
-"""Packed results of a method: one zip file with the rows, the answers and where they come from.
+"""Packed results of a method (`eval.leaderboard.packing`): one zip file with rows, answers, where they come from.
 
     submission.json                      method, plan, versions, and of each pair its row and the digests of its answer
     answers/<number of the pair>/answer.json, answer.npz
@@ -23,41 +23,29 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, ConfigDict, Field
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import list_members, parse_json, read_bytes, read_member, require_plain_file
-from cdpipe.core.names import LONGEST, path_part, visible
-from cdpipe.core.whole_file import whole_file
+from cdpipe.core.files import list_members, parse_json, read_member, require_plain_file
+from cdpipe.core.names import LONGEST, visible
 from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.io.answer_parts import MAX_ERROR
-from eval.core.output import made_parents, require_replaceable, unwritable
-from eval.core.provenance import git_commit, machine, versions
-from eval.leaderboard.calls import (
-    EvaluationFile,
-    digest_method,
-    digest_pair,
-    is_exchanged,
-    list_merges,
-    read_call,
-    read_evaluation,
-)
+from eval.leaderboard.calls import digest_pair
 from eval.leaderboard.given_merge import MergeMode
 from eval.running.cell_rows import TEXT_COLUMNS
 from eval.running.predictions import is_name_of_ours
 from eval.running.results.tables import LARGEST
-from eval.running.runfolder import RunFolder, json_text
+from eval.running.runfolder import RunFolder
 from eval.scoring.scoring import METRICS_VERSION, score_stored
 from eval.truth.ground_truth import load_ground_truth
 
-_MANIFEST = "submission.json"
-_HEAD = _MANIFEST.encode()  # the name of the first member stands near the start of the file
-_FILES = ("answer.json", "answer.npz")
-_MOST_BYTES = 4 << 30
+MANIFEST = "submission.json"
+FILES = ("answer.json", "answer.npz")
+MOST_BYTES = 4 << 30
 _EXPECTED = "expected a file that `tunnelcd submit DIR --out FILE.zip` makes"
-_TOLD = 3
 _ROUNDING = 1e-6
 # columns of a row that say who answered what, which scoring does not know
 _NAMES = {"scenario", "seed", "variant", "preset", "pair_kind", "commit"}
 # columns of numbers in the row of a pair that cannot be made; others would be figures
 _UNMADE = {"seed", "metrics_version", "is_contended"}
+_TRUTH_VALUES = {"is_unchanged_pair", "is_alarm", "is_contended", "is_auroc_assumed"}
 _Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 _Text = Annotated[str, Field(max_length=MAX_ERROR)]
 _Name = Annotated[str, Field(min_length=1, max_length=LONGEST)]
@@ -122,65 +110,26 @@ class CheckedFile:
     content: Submission
 
 
-def pack_submission(run: RunFolder, name: str, out: Path) -> int:
-    """Pack the results of an evaluated method.
-
-    Args:
-        run: The run folder.
-        name: The method; "" for the only one that was evaluated there.
-        out: The zip file.
-
-    Returns:
-        How many pairs it holds.
-
-    Raises:
-        InputError: Pairs lack an answer or its row, or these are not of the present pairs or metrics; or `out` cannot
-            be written.
-    """
-    if out.suffix != ".zip" or out.is_dir():
-        raise InputError(f"--out {out}: expected the name of a new file that ends in .zip")
-    require_replaceable(out, _HEAD, "file of `tunnelcd submit`")
-    evaluation = read_evaluation(run, _find_method(run, name))
-    parts, answers = _collect(run, evaluation)
-    told = {
-        "name": evaluation.name, "command": [_without_folders(word) for word in evaluation.command],
-        "merge": evaluation.merge, "limit_s": evaluation.limit_s,
-        "programs": {_without_folders(path): digest for path, digest in evaluation.programs.items()},
-        "plan": evaluation.plan, "split": evaluation.split, "metrics_version": METRICS_VERSION, "commit": git_commit(),
-        "machine": machine(), "versions": versions(), "pairs": parts,
-    }  # fmt: skip
-    document = validate(Submission, Document(f"{run.path}: {evaluation.name}", told))
-    try:
-        with made_parents(out), whole_file(out) as partial, zipfile.ZipFile(partial, "w") as archive:
-            _add(archive, _MANIFEST, json_text(document.model_dump()).encode())
-            for number, answer in enumerate(answers):
-                for file in parts[number].files:
-                    _add(archive, _member(number, file), (answer / file).read_bytes())
-    except OSError as error:
-        raise unwritable(out, error) from error
-    return len(parts)
-
-
 def read_submission(path: Path) -> CheckedFile:
     """Read a packed submission and compare all digests; nothing is written.
 
     Raises:
         InputError: It is damaged, not complete, or of another metrics version.
     """
-    n_bytes = require_plain_file(path, _MOST_BYTES, _EXPECTED)
+    n_bytes = require_plain_file(path, MOST_BYTES, _EXPECTED)
     with _opened(path, n_bytes) as (archive, members):
-        if _MANIFEST not in members:
-            raise ValueError(f"no {_MANIFEST} in it")
-        content = parse_json(read_member(archive, members[_MANIFEST]).tobytes())
-        document = validate(Submission, Document(f"{path}:{_MANIFEST}", content))
+        if MANIFEST not in members:
+            raise ValueError(f"no {MANIFEST} in it")
+        content = parse_json(read_member(archive, members[MANIFEST]).tobytes())
+        document = validate(Submission, Document(f"{path}:{MANIFEST}", content))
         _check_rows(document)
         declared = {
-            _member(number, file): part
+            member_name(number, file): part
             for number, pair in enumerate(document.pairs)
             for file, part in pair.files.items()
         }
-        if others := sorted({*members} ^ {*declared, _MANIFEST})[:1]:
-            raise ValueError(f"{visible(others[0])[:200]} is in the archive or in {_MANIFEST}, not in both")
+        if others := sorted({*members} ^ {*declared, MANIFEST})[:1]:
+            raise ValueError(f"{visible(others[0])[:200]} is in the archive or in {MANIFEST}, not in both")
         for name, part in declared.items():
             if members[name].file_size != part.n_bytes:
                 raise ValueError(f"{name} has {members[name].file_size} bytes, {part.n_bytes} were packed")
@@ -232,52 +181,8 @@ def _iterate_answers(found: CheckedFile) -> Iterator[tuple[PairPart, dict[str, b
     """Yield each pair and the content of the files of its answer."""
     with _opened(found.path, found.path.stat().st_size) as (archive, members):
         for number, pair in enumerate(found.content.pairs):
-            names = {file: members[_member(number, file)] for file in pair.files}
+            names = {file: members[member_name(number, file)] for file in pair.files}
             yield pair, {file: read_member(archive, member).tobytes() for file, member in names.items()}
-
-
-def _collect(run: RunFolder, evaluation: EvaluationFile) -> tuple[list[PairPart], list[Path]]:
-    """Return the parts and the folders of all answers; refuse to pack some of them only."""
-    parts, answers, mistakes, called = [], [], [], digest_method(evaluation)
-    for scenario, seed in evaluation.pairs:
-        answer = run.answer(scenario, seed, evaluation.name)
-        call = read_call(run, evaluation.name, scenario, seed)
-        cell = run.read_cell(run.cell(scenario, seed, evaluation.name))
-        held = digest_pair(run.pair(scenario, seed))
-        is_there = call is not None and cell is not None and (not call.pair_digest or (answer / _FILES[0]).is_file())
-        if call is None or cell is None or not is_there or cell["row"].get("metrics_version") != METRICS_VERSION:
-            mistakes.append(f"{scenario} {seed}")
-        elif call.method_digest != called:
-            mistakes.append(f"{scenario} {seed} (of another command)")
-        elif held and held != call.pair_digest:
-            mistakes.append(f"{scenario} {seed} (simulated anew since)")
-        elif is_exchanged(call, answer):
-            mistakes.append(f"{scenario} {seed} (its answer was exchanged)")
-        else:
-            files = {file: _describe(answer / file) for file in _FILES if (answer / file).is_file()}
-            part = {"scenario": scenario, "seed": seed, "pair_digest": call.pair_digest, "seconds": call.seconds,
-                    "row": cell["row"], "files": files}  # fmt: skip
-            parts.append(validate(PairPart, Document(f"{run.path}: {scenario} {seed}", part)))
-            answers.append(answer)
-    if mistakes:
-        more = f" and {len(mistakes) - _TOLD} more" if len(mistakes) > _TOLD else ""
-        raise InputError(
-            f"{run.path}: {evaluation.name} lacks {len(mistakes)} of {len(evaluation.pairs)} pairs "
-            f"({', '.join(mistakes[:_TOLD])}{more}): the same `tunnelcd evaluate` goes on there"
-        )
-    return parts, answers
-
-
-def _find_method(run: RunFolder, name: str) -> str:
-    parts = [path.parent.name for path in sorted(run.path.glob("evaluations/*/evaluation.json"))]
-    if not parts:
-        raise InputError(f"{run.path}: no method was evaluated here: `tunnelcd evaluate --out {run.path}` first")
-    if path_part(name) in parts or (not name and len(parts) == 1):
-        return name or parts[0]
-    told = ", ".join(map(visible, list_merges(run)))
-    if name:
-        raise InputError(f"{run.path}: --as {name}: no method of this name was evaluated here, but {told}")
-    raise InputError(f"{run.path}: holds {told}: name one with --as")
 
 
 def _check_rows(document: Submission) -> None:
@@ -299,7 +204,7 @@ def _check_rows(document: Submission) -> None:
         if pair.row.get("variant") != document.name or pair.row.get("metrics_version") != METRICS_VERSION:
             raise ValueError(f"the row of {visible(pair.scenario)} {pair.seed} is of another method or other metrics")
         is_ok = pair.row.get("status") == "ok"
-        if not isinstance(pair.row.get("status"), str) or (is_ok and set(pair.files) != set(_FILES)):
+        if not isinstance(pair.row.get("status"), str) or (is_ok and set(pair.files) != set(FILES)):
             raise ValueError(f"the row of {visible(pair.scenario)} {pair.seed} has no status, or no answer")
         if not pair.files:
             _require_no_figures(pair)
@@ -308,6 +213,8 @@ def _check_rows(document: Submission) -> None:
                 raise ValueError(f"{visible(key)[:40]} = {value[:40]!r}: expected a number")
             if isinstance(value, float) and abs(value) > LARGEST:
                 raise ValueError(f"{visible(key)[:40]} = {value}: larger than any figure is")
+            if key in _TRUTH_VALUES and not (value is None or value in (0, 1) or math.isnan(value)):
+                raise ValueError(f"{key} = {value}: expected a truth value")
 
 
 def _require_no_figures(pair: PairPart) -> None:
@@ -334,29 +241,14 @@ def _opened(path: Path, n_bytes: int) -> Iterator[tuple[zipfile.ZipFile, Mapping
         raise InputError(f"{path}: {said:.300}: {_EXPECTED}") from error
 
 
-def _member(number: int, file: str) -> str:
+def member_name(number: int, file: str) -> str:
+    """Return the name in the archive of a file of the answer to a pair."""
     return f"answers/{number:05d}/{file}"
-
-
-def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
-    """Add a member that carries no time, so that the same results give the same bytes."""
-    archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED if name.endswith(".json") else None)
-
-
-def _describe(path: Path) -> dict[str, Any]:
-    content = read_bytes(path)
-    return {"sha256": hashlib.sha256(content).hexdigest(), "n_bytes": len(content)}
 
 
 def _digest_file(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _without_folders(word: str) -> str:
-    """Return a word of a command without the folders of this machine: `/a/b.py` is `b.py`, `--w=/a/b` is `--w=b`."""
-    name, sign, value = ("", "", word) if Path(word).is_absolute() else word.partition("=")
-    return f"{name}{sign}{Path(value).name}" if Path(value).is_absolute() else word
 
 
 def _is_same(stored: Any, scored: Any) -> bool:

@@ -65,7 +65,8 @@ def explain_unreadable_plan(provenance: Mapping[str, Any]) -> str:
 
 def _read(provenance: Mapping[str, Any]) -> tuple[Plan | None, str]:
     document = provenance.get("plan")
-    if not isinstance(document, dict) or "scenarios" not in document:  # of a run that stored no plan
+    # of a run that stored no plan, or of others' methods alone (`eval.running.runner.start_provenance`)
+    if not isinstance(document, dict) or "scenarios" not in document or document.get("variants") == []:
         return None, ""
     try:
         return validate(Plan, Document("provenance.json", document)), ""

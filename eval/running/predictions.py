@@ -20,6 +20,7 @@ import pandas as pd
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import folded, path_part, require_table_name, visible
+from cdpipe.core.whole_file import whole_file
 from cdpipe.core.yamlfile import suggest
 from cdpipe.model.config import preset_names
 from eval.core.output import copy_folder, remove
@@ -73,10 +74,10 @@ def add_predictions(run: RunFolder, folder: Path, name: str, progress: RunProgre
         scenario, seed = document["row"]["scenario"], int(pair.name)
         answer = run.answer(scenario, seed, name)
         remove(answer)
-        answer.mkdir(parents=True)
-        for file in _FILES:
+        for file in reversed(_FILES):  # answer.json last: after an interrupt the same call begins anew
             if (found[pair] / file).is_file():
-                shutil.copyfile(found[pair] / file, answer / file)
+                with whole_file(answer / file) as partial:
+                    shutil.copyfile(found[pair] / file, partial)
         write_json(run.cell(scenario, seed, name), document)
     progress.cells("done", len(documents), len(documents))
     write_tables(run)

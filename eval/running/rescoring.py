@@ -24,7 +24,7 @@ def rescore(run: RunFolder, progress: RunProgress | None = None) -> int:
     """Score every stored answer of a run again and rewrite the tables.
 
     An answer of another program becomes a variant named like its folder. Nothing is written before all answers are
-    scored, so a damaged answer or an interrupt leaves the run as it was.
+    scored, so a damaged answer or an interrupt until then leaves the run as it was. Tables are of before or of after.
 
     Returns:
         How many answers were scored.

@@ -1,6 +1,7 @@
 """The run folder: its layout, its finished cells, and the tables made from them.
 
 provenance.json                               marks a run folder; written first
+copied.json                                   since when a copy at a URL is whole (eval.running.scaling.mirror)
 blind.json                                    opaque names of the pairs (eval.running.export), once exported
 pairs/<world>/<seed>/{before,after,truth}     simulated pairs; a world is a scenario, with what is set over it
 answers/<world>/<seed>/<variant>/             raw answers (cdpipe.io.answer)
@@ -42,7 +43,7 @@ from cdpipe.core.whole_file import whole_file
 from eval.core.output import make_writable, remove, require_no_links
 from eval.core.provenance import FORMAT_VERSION, TOOL
 from eval.core.statistics import summarise
-from eval.core.tablefile import read_table, write_rows
+from eval.core.tablefile import read_table, replace_table, write_rows
 from eval.plans.coverage import explain_unreadable_plan, measure_coverage, read_stored_plan
 from eval.plans.targets import read_targets
 from eval.plans.worlds import world_slug
@@ -62,6 +63,7 @@ from eval.tables.surface.table import surface_tables
 # What provenance.json says of the run that made the cells; plan, settings and checkpoints are those of the last run.
 _OF_THE_START = ("started", "finished", "command", "machine")
 _OF_THE_MAKING = (*_OF_THE_START, "git_commit", "versions", "parts")
+NEW_TABLES = ".tables.partial"  # in the run folder, while tables are written
 _MAP_CELL_M = 0.1  # pictures number no smaller cells
 _MAPS = {"before_points": ArraySpec("N,3", "float32"), "after_points": ArraySpec("M,3", "float32")}
 
@@ -196,6 +198,8 @@ def open_run_folder(path: Path) -> RunFolder:
 def write_tables(run: RunFolder) -> pd.DataFrame:
     """Write results.csv, the item tables, summary.csv and the other tables from the finished cells.
 
+    All of them are written before the first takes the place of an earlier one.
+
     Returns:
         The rows of results.csv.
 
@@ -204,22 +208,30 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     """
     collected = collect_tables(run)
     results, items = collected["results"], {table: collected[table] for table in ITEM_TABLES}
-    write_rows(run.path / "results.csv", results)
-    for table, frame in items.items():
-        write_rows(run.path / f"{table}.csv", frame)
     usable = {table: without_unusable(frame) for table, frame in collected.items()}
-    _write_csv(run.path / "summary.csv", summarise(usable["results"], keyframes=usable["keyframes"]))
     tables = {
+        "summary": summarise(usable["results"], keyframes=usable["keyframes"]),
         **{table: collected[table] for table in SURFACE_TABLES},
         "effects": effects(usable["results"]),
         "merge": merge_table(usable["results"], read_targets(run.stored_provenance())),
         **_report_tables(run, usable["results"], usable),
     }
-    for name, frame in tables.items():
-        if len(frame):
-            _write_csv(run.path / f"{name}.csv", frame)
-        elif not (name in HARD_FILES and explain_unreadable_plan(run.stored_provenance())):
-            remove(run.path / f"{name}.csv")
+    is_readable = not explain_unreadable_plan(run.stored_provenance())
+    hidden = run.path / NEW_TABLES
+    remove(hidden)
+    try:
+        for name, frame in {"results": results, **items}.items():
+            write_rows(hidden / f"{name}.csv", frame)
+        for name, frame in tables.items():
+            if len(frame) or name == "summary":
+                _write_csv(hidden / f"{name}.csv", frame)
+        for name in (*items, "results", *tables):
+            if (hidden / f"{name}.csv").exists():
+                replace_table(hidden / f"{name}.csv", run.path / f"{name}.csv")
+            elif name not in HARD_FILES or is_readable:
+                remove(run.path / f"{name}.csv")
+    finally:
+        remove(hidden)
     return results
 
 

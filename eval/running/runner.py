@@ -122,16 +122,17 @@ def run_plan(
             _remove_stale(run, pair, force)
         if mirror is not None:
             mirror.forget(run, pairs)
+            mirror.start(run)
         done = None if mirror is None else partial(mirror.copy_pair, run)
         if client is None:
             _run_here(run, chosen, made, progress, tools, done)
         else:
             run_on_workers(client, run, chosen, made, progress, done)
-    _settle(run, pairs, keep, progress, tools)
     progress.cells("done", n_run, n_run)
     if results is None:
         results = write_tables(run)
         write_json(run.path / "provenance.json", {**provenance, "finished": provenance["finished"] or tools.now()})
+    _settle(run, pairs, keep, progress, tools)
     if mirror is not None:
         mirror.copy_missing(run)
         mirror.copy_tables(run)

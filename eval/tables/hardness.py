@@ -15,8 +15,8 @@ import pandas as pd
 from eval.core.statistics import interval_of, mean
 from eval.plans.axes import Step, world_of_step
 from eval.plans.plan import Plan, list_methods, with_step
-from eval.tables.regions.curves import ranked_pairs, recall_at, resampled_recalls
-from eval.tables.rows import count_failed, numbers
+from eval.tables.regions.curves import NEEDED, ranked_pairs, recall_at, resampled_recalls
+from eval.tables.rows import count_failed, numbers, of_cases
 
 FILES = ("hard", "breaking_points")
 RATE_PER_100M = 0.1
@@ -104,7 +104,7 @@ def _variants_of_step(plan: Plan, step: Step) -> list[str]:
 def _measure(results: pd.DataFrame, regions: pd.DataFrame, changes: pd.DataFrame) -> dict[str, float]:
     if len(results) == 0:
         return {**dict.fromkeys(_COUNTS, 0), **dict.fromkeys((_RECALL, *_MEANS), math.nan)}
-    ranked = ranked_pairs(results, regions, changes)
+    ranked = ranked_pairs(results, *(of_cases(items, results, NEEDED) for items in (regions, changes)))
     low, high = interval_of(resampled_recalls(ranked, RATE_PER_100M)) if ranked.has_interval else (math.nan, math.nan)
     return {
         "n_pairs": len(results),

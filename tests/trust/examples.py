@@ -25,8 +25,8 @@ from cdpipe.model.config import load_config
 from eval.cli.listing import list_entries
 from eval.core.tablefile import read_table
 from eval.leaderboard.calls import describe_calls, evaluation_folder, read_evaluation
+from eval.leaderboard.packing import pack_submission
 from eval.leaderboard.reference import find_reference
-from eval.leaderboard.submission import pack_submission
 from eval.plans.plan import load_plan
 from eval.release.content import load_release
 from eval.report.answer.content import read_content

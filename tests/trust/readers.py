@@ -37,8 +37,9 @@ from cdpipe.training.data import ChangePairs, open_dataset, read_place_data
 from cdpipe.training.fit import FitConfig, fit
 from cdpipe.training.shard import FIELDS, FORMAT, FORMAT_VERSION, encode_shard, read_shard
 from cdpipe.training.sphere_training import read_sphere_data
+from eval.leaderboard.packing import pack_submission
 from eval.leaderboard.page import write_leaderboard
-from eval.leaderboard.submission import pack_submission, read_submission
+from eval.leaderboard.submission import read_submission
 from eval.plans.cells import expand_cells
 from eval.plans.plan import load_plan
 from eval.release.archive import pack, unpack_release, write_sums

@@ -112,11 +112,7 @@ def open_recording(path: Path, how: HowToRead, report: Progress) -> PosedClouds:
             check_quaternion_order(source, source.poses_from)
         return source
     with _removed_on_error(Path(tempfile.mkdtemp(prefix="tunnelcd-read-"))) as folder:
-        write_scans(source, folder / "scans", report)
-        clouds = open_folder(folder / "scans", "ply", has_poses=True)
-        opened = PosedClouds(clouds, source.odom_T_sensor, source.stamps_s, None)
-        if how.trajectory is not None:
-            check_quaternion_order(opened, source.poses_from)
+        opened = _write_stream(source, folder / "scans", how, report)
     opened.name, opened.is_temporary = str(path), True
     weakref.finalize(opened, shutil.rmtree, folder, ignore_errors=True)
     return opened
@@ -131,10 +127,23 @@ def convert_recording(path: Path, out: Path, how: HowToRead, report: Progress) -
     source = _pose(_open_clouds(path, how), how, report)
     if isinstance(source.clouds, MapStations):
         raise InputError(f"{path}: a map without its scans is no session: `detect` takes it as it is")
-    if not source.clouds.is_stream and how.odometry is None:
-        check_quaternion_order(source, source.poses_from)
-    write_scans(source, out, report)
+    if source.clouds.is_stream:
+        _write_stream(source, out, how, report)
+    else:
+        if how.odometry is None:
+            check_quaternion_order(source, source.poses_from)
+        write_scans(source, out, report)
     return len(source.odom_T_sensor), source.poses_from
+
+
+def _write_stream(source: _Posed, folder: Path, how: HowToRead, report: Progress) -> PosedClouds:
+    """Write scans that can be read once, and open them; poses of a file are checked against them then."""
+    write_scans(source, folder, report)
+    clouds = open_folder(folder, "ply", has_poses=True)
+    opened = PosedClouds(clouds, source.odom_T_sensor, source.stamps_s, None)
+    if how.trajectory is not None:
+        check_quaternion_order(opened, source.poses_from)
+    return opened
 
 
 def write_scans(source: _Posed, out: Path, report: Progress) -> None:

@@ -102,9 +102,16 @@ def read_times(path: Path) -> Float64Array:
     """
     lines = _lines(path)
     if all(_DATE.fullmatch(line) for _, line in lines):
-        dates = np.array([line.replace(" ", "T") for _, line in lines], "datetime64[ns]")
+        dates = np.array([_date(f"{path}:{number}", line) for number, line in lines], "datetime64[ns]")
         return _rising(path, dates.astype(np.int64) / 1e9)
     return _rising(path, _seconds(_numbers(path, lines, 1)[0][:, 0]))
+
+
+def _date(where: str, line: str) -> np.datetime64:
+    try:
+        return np.datetime64(line.replace(" ", "T"), "ns")
+    except ValueError as error:
+        raise InputError(f"{where}: {line}: no such date and time: expected YYYY-MM-DD HH:MM:SS.S") from error
 
 
 def poses_at(trajectory: Trajectory, stamps_s: Float64Array, name: str) -> Float64Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 from pydantic.fields import FieldInfo
@@ -109,6 +109,12 @@ def setting_fields() -> Iterator[tuple[str, FieldInfo]]:
             yield name, info
 
 
-def settings_table() -> list[tuple[str, Any, str]]:
-    """Return (key, default, meaning) of every setting, for documentation."""
-    return [(key, info.default, info.description or "") for key, info in setting_fields()]
+def settings_table() -> list[tuple[str, str, str]]:
+    """Return (key, default, meaning) of every setting, for documentation; other choices stand behind a default."""
+    return [(key, _show_choices(info), info.description or "") for key, info in setting_fields()]
+
+
+def _show_choices(info: FieldInfo) -> str:
+    is_choice = get_origin(info.annotation) is Literal
+    others = [str(value) for value in get_args(info.annotation) if is_choice and value != info.default]
+    return f"{info.default}; {', '.join(others)}" if others else f"{info.default}"

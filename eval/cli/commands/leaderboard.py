@@ -62,7 +62,8 @@ def evaluate(
     ] = "own",
     seeds: Annotated[str | None, typer.Option(metavar="A:B", help="replaces the plan's seeds; B excluded")] = None,
     split: Annotated[
-        Literal["dev", "sealed"], typer.Option(help="`sealed`: the seeds of the committed results of some plans")
+        Literal["dev", "sealed"],
+        typer.Option(help="`sealed`: seeds of this version, as some committed results have"),
     ] = "dev",
     time_limit: Annotated[float, typer.Option(min=0.1, max=86_400, help="seconds for one pair, wall clock")] = 600.0,
     reference: Annotated[
@@ -130,7 +131,7 @@ def submit(
     quiet: Quiet = False,
 ) -> None:
     """Pack the rows, answers and provenance of an evaluated method into one file."""
-    from eval.leaderboard.submission import pack_submission
+    from eval.leaderboard.packing import pack_submission
     from eval.running.runfolder import open_run_folder
 
     n_pairs = pack_submission(open_run_folder(folder), name, out)

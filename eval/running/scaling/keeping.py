@@ -18,7 +18,7 @@ from cdpipe.core.yamlfile import Document, Settings, validate
 from eval.core.output import remove
 from eval.core.provenance import digest
 from eval.running.cell_file import NO_KEY
-from eval.running.runfolder import RunFolder, write_json
+from eval.running.runfolder import NEW_TABLES, RunFolder, write_json
 from eval.running.stages.stage_cache import files_digest
 from sim.session.truth import read_pair_truth
 
@@ -84,14 +84,15 @@ def remove_pair(path: Path) -> None:
 
 
 def remove_leftovers(run: RunFolder) -> None:
-    """Remove what an interrupted removal, or making again, left."""
-    for path in (*run.path.glob("pairs/*/.*.removed"), *run.path.glob("pairs/*/.*.again")):
+    """Remove what an interrupted removal, making again, or writing of tables left."""
+    for path in (*run.path.glob("pairs/*/.*.removed"), *run.path.glob("pairs/*/.*.again"), run.path / NEW_TABLES):
         remove(path)
 
 
 def digest_files(pair: Path) -> str:
     """Return the digest of all files of a pair that the simulator writes."""
-    return files_digest(pair, [path for path in pair.rglob("*") if path.is_file() and _DERIVED.isdisjoint(path.parts)])
+    files = [path for path in pair.rglob("*") if path.is_file()]
+    return files_digest(pair, [path for path in files if _DERIVED.isdisjoint(path.relative_to(pair).parts)])
 
 
 def dropped_file(run: RunFolder, world: str, seed: int) -> Path:

@@ -1,9 +1,9 @@
 """Unites run folders of one plan: the shards of a run, or parts of it that machines made.
 
 Every finished cell comes into the new folder once, with its answer. A cell that two folders hold must be the same in
-both: its key, its row and items, and its answer, times apart. What `tunnelcd evaluate` keeps comes along, and so do
-sessions and maps, as hard links where the disks allow it, else as copies. Stored stages and the names of `tunnelcd
-export` stay behind. The new folder appears when it is complete.
+both: its key, its row and items, and its answer where both have one, times apart. So must the sessions of a pair. What
+`tunnelcd evaluate` keeps comes along, and so do sessions and maps, as hard links where the disks allow it, else as
+copies. Stored stages and the names of `tunnelcd export` stay behind. The new folder appears when it is complete.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from eval.plans.cells import list_planned_cases
 from eval.plans.coverage import explain_unreadable_plan, read_stored_plan
 from eval.running.cell_rows import ITEM_TABLES, SURFACE_TABLES
 from eval.running.runfolder import RunFolder, open_run_folder, write_json, write_tables
-from eval.running.scaling.keeping import read_dropped
+from eval.running.scaling.keeping import digest_files, read_dropped
 from eval.running.scaling.merged_provenance import unite_provenance
 from eval.running.scaling.shards import number_pairs, stored_shard
 
@@ -71,7 +71,7 @@ def merge_runs(
 
     Raises:
         InputError: A folder is no run, the runs are not of one plan, version, machine setting or set of weights, a cell
-            differs between two of them, none is finished, or `out` holds something.
+            or a pair differs between two of them, none is finished, or `out` holds something.
     """
     runs, progress = _open_runs(folders), progress or Silent()
     told = [run.provenance() for run in runs]
@@ -79,6 +79,7 @@ def merge_runs(
     _require_outside(out, runs)
     evaluations = _unite_evaluations(runs)
     sources, n_shared = _find_cells(runs, progress)
+    _require_same_pairs(runs, progress)
     with new_folder(out) as partial:
         merged = RunFolder(partial)
         write_json(partial / "provenance.json", {**provenance, "finished": None})
@@ -128,7 +129,8 @@ def _find_cells(runs: Sequence[RunFolder], progress: RunProgress) -> tuple[dict[
             if name in sources:
                 _require_same(name, sources[name], run, cell)
                 shared.add(name)
-            sources.setdefault(name, run)
+            if name not in sources or not (sources[name].path / _answer_of(name)).is_dir():
+                sources[name] = run
             versions.setdefault(str(cell["row"].get("metrics_version")), run.path)
     if len(versions) > 1:
         told = ", ".join(f"{where}: metrics version {version}" for version, where in versions.items())
@@ -149,8 +151,8 @@ def _require_same(name: str, first: RunFolder, second: RunFolder, cell: Mapping[
     """Refuse a cell of which two runs hold different results."""
     other = first.read_cell(first.path / name)
     difference = "one of the files is damaged" if other is None else next(find_differences(other, cell), "")
-    answers = [run.path / "answers" / Path(name).relative_to("cells").with_suffix("") for run in (first, second)]
-    if not difference and _digest_answer(answers[0]) != _digest_answer(answers[1]):
+    digests = [_digest_answer(run.path / _answer_of(name)) for run in (first, second)]
+    if not difference and all(digests) and digests[0] != digests[1]:  # one may have rows alone
         difference = "the stored answers"
     if difference:
         case = "{scenario} {seed} {variant}".format(**cell["row"])
@@ -198,9 +200,14 @@ def _digest_answer(folder: Path) -> str:
     return digest([told, content, {name: [array.dtype.str, *array.shape] for name, array in stored.items()}])
 
 
+def _answer_of(cell: str) -> Path:
+    """Return the folder of the answer of a cell, below its run folder."""
+    return Path("answers", *Path(cell).parts[1:]).with_suffix("")
+
+
 def _take_cell(source: Path, target: Path, name: Path) -> None:
     """Copy the answer of a cell and then the cell."""
-    answer = Path("answers", *name.parts[1:]).with_suffix("")
+    answer = _answer_of(name.as_posix())
     if (source / answer).is_dir():
         (target / answer).mkdir(parents=True)
         for file in _ANSWER:
@@ -227,20 +234,42 @@ def _take_pairs(runs: Sequence[RunFolder], target: Path, progress: RunProgress) 
             _link_or_copy(path, target / name)
 
 
+def _require_same_pairs(runs: Sequence[RunFolder], progress: RunProgress) -> None:
+    """Refuse a pair of which two runs answered different sessions; of removed ones the record tells."""
+    holders: dict[str, dict[Path, Path]] = {}
+    for run in runs:
+        records = {path.with_suffix(""): path for path in sorted(run.path.glob("dropped/*/*.json"))}
+        pairs = {path.parents[1]: path.parents[1] for path in sorted(run.path.glob("pairs/*/*/truth/changes.json"))}
+        for path, place in (records | pairs).items():
+            holders.setdefault("/".join(path.parts[-2:]), {})[run.path] = place
+    shared = {name: places for name, places in holders.items() if len(places) > 1}
+    for done, (name, places) in enumerate(shared.items()):
+        progress.stage("pairs compared", done, len(shared))
+        digests = {where: _digest_pair(place) for where, place in places.items()}
+        (first, digest_there), *others = digests.items()
+        for where, found in others:
+            if found != digest_there:
+                world, seed = name.split("/")
+                rows = (run.any_row(world) for run in runs)
+                case = f"{next((row['scenario'] for row in rows if row is not None), world)} {seed}"
+                raise InputError(
+                    f"{case}: {first} and {where} answered different sessions (digest {digest_there} and {found}): "
+                    "run it again in one of them with --force"
+                )
+
+
+def _digest_pair(place: Path) -> str | None:
+    if place.is_dir():
+        return digest_files(place)
+    record = read_dropped(place)
+    return None if record is None else record.digest
+
+
 def _take_records(runs: Sequence[RunFolder], target: Path) -> None:
-    """Copy the records of removed sessions, which must agree."""
-    digests: dict[str, tuple[str, Path]] = {}
+    """Copy the records of removed sessions."""
     for run in runs:
         for path in sorted(run.path.glob("dropped/*/*.json")):
-            name, record = path.relative_to(run.path).as_posix(), read_dropped(path)
-            if record is None:
-                continue
-            other, where = digests.setdefault(name, (record.digest, run.path))
-            if other != record.digest:
-                raise InputError(
-                    f"{record.world} {record.seed}: {where} and {run.path} answered different sessions (digest {other} "
-                    f"and {record.digest}): run it again in one of them with --force"
-                )
+            name = path.relative_to(run.path)
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target / name)
 

@@ -21,13 +21,14 @@ from cdpipe.core.whole_file import whole_file
 from eval.core.provenance import TOOL
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.running.pair_run import Pair
-from eval.running.runfolder import RunFolder
+from eval.running.runfolder import RunFolder, read_json, write_json
 
 _ANSWER = ("answer.npz", "answer.json")
 _PART = r"(?!\.)[A-Za-z0-9._=,-]{1,210}"
 _CELL = re.compile(rf"cells/{_PART}/\d{{1,15}}/{_PART}\.json", re.ASCII)
 _STORED_ANSWER = re.compile(rf"answers/{_PART}/\d{{1,15}}/{_PART}/answer\.(json|npz)", re.ASCII)
 _MAX_ANSWER_BYTES = 1 << 30
+_RECORD = "copied.json"  # in the run folder: when the newest cell was written that is at a URL
 
 
 class Mirror:
@@ -45,6 +46,7 @@ class Mirror:
             raise InputError("a URL with a password would stand in provenance.json: leave it to fsspec's configuration")
         self.url = url
         self._fs, self._root = _open(url)
+        self._same: dict[str, int] = {}  # cells that are alike here and there, and when they were written here
 
     def provenance(self) -> dict[str, Any]:
         """Return the provenance of the run there; {} where there is none.
@@ -74,6 +76,7 @@ class Mirror:
         """
         names = [name for name in self._list("cells") if _CELL.fullmatch(name) and not (run.path / name).exists()]
         self._get(run.path, names, progress or Silent())
+        self._same |= {name: (run.path / name).stat().st_mtime_ns for name in names}
 
     def fetch_all(self, folder: Path, progress: RunProgress | None = None) -> None:
         """Take provenance, cells and answers into an empty folder.
@@ -101,6 +104,14 @@ class Mirror:
                 if name.rpartition("/")[0] in running and not (run.path / name).exists():
                     self._fs.rm_file(self._place(name))
 
+    def start(self, run: RunFolder) -> None:
+        """Copy the provenance, so that a copy which an interrupt cuts short is one of a run.
+
+        Raises:
+            InputError: The place cannot be written.
+        """
+        self._put(run, [run.path / "provenance.json"])
+
     def copy_pair(self, run: RunFolder, pair: Pair) -> None:
         """Copy the answers of the cells of a pair that ran, and then the cells, whose files say that they are finished.
 
@@ -111,19 +122,28 @@ class Mirror:
             self._copy_cell(run, run.cell(pair.name, pair.seed, each.cell.variant))
 
     def copy_missing(self, run: RunFolder) -> None:
-        """Copy the finished cells that are not there: of an interrupted pair, or of a run that began without a copy.
+        """Copy the finished cells that are not there, or were written since the last copy ended.
+
+        Those are of an interrupted pair, or of a command that was not told of the copy.
 
         Raises:
             InputError: The place cannot be written.
         """
-        stored = set(self._list("cells"))
-        for cell in sorted(run.path.glob("cells/*/*/*.json")):
-            if _relative(run, cell) not in stored:
-                self._copy_cell(run, cell)
+        stored, record = set(self._list("cells")), run.path / _RECORD
+        copied_ns = read_json(record).get(self.url, 0)
+        cells = {_relative(run, path): path for path in sorted(run.path.glob("cells/*/*/*.json"))}
+        written_ns = {name: path.stat().st_mtime_ns for name, path in cells.items()}
+        for name, path in cells.items():
+            is_old = isinstance(copied_ns, int) and written_ns[name] <= copied_ns
+            if name not in stored or not (is_old or self._same.get(name) == written_ns[name]):
+                self._copy_cell(run, path)
+        write_json(record, {**read_json(record), self.url: max(written_ns.values(), default=0)})
 
     def _copy_cell(self, run: RunFolder, cell: Path) -> None:
         answer = run.path / "answers" / cell.relative_to(run.path / "cells").with_suffix("")
+        written_ns = cell.stat().st_mtime_ns
         self._put(run, [*(answer / name for name in _ANSWER if (answer / name).is_file()), cell])
+        self._same[_relative(run, cell)] = written_ns
 
     def copy_tables(self, run: RunFolder) -> None:
         """Copy provenance and tables.

@@ -27,6 +27,8 @@ from eval.core.statistics import N_RESAMPLES, interval_of
 from eval.tables.rows import PAIR, forced, tunnel_numbers
 
 RATES_PER_100M = (0.1, 0.5)
+# columns of items that an empty table must have here, and for what is made beside the curves
+NEEDED = ("id", "is_observable", "is_found", "n_truth_cells", "score", "found_changes", "is_withdrawn", "label")
 _BATCH = 100
 # So many of the best candidates are looked at first.
 _FIRST_CANDIDATES = 256

@@ -22,6 +22,7 @@ from eval.tables.conditions import by_condition, told_apart
 from eval.tables.groups import recall_by_size
 from eval.tables.regions.budgets import budget_rows
 from eval.tables.regions.curves import (
+    NEEDED,
     RATES_PER_100M,
     RankedPairs,
     free_response,
@@ -48,7 +49,6 @@ _MEANS = (
     "region_precision",
 )  # fmt: skip
 _MEDIANS = ("t_descriptor_per_keyframe_s", "t_cd_per_region_s")
-_NEEDED = ("id", "is_observable", "is_found", "n_truth_cells", "score", "found_changes", "is_withdrawn", "label")
 
 
 def region_tables(
@@ -81,7 +81,7 @@ def region_tables(
         for variant, own in cases.groupby("variant", sort=False):
             names = {"domain": domain, "variant": str(variant), **condition.columns}
             regions, changes, keyframes = (
-                of_cases(part.get(str(variant), items[name][:0]), own, _NEEDED)
+                of_cases(part.get(str(variant), items[name][:0]), own, NEEDED)
                 for name, part in items_by_variant.items()
             )
             each = ranked_pairs(own, regions, changes)
@@ -127,7 +127,7 @@ def _budgets_by_site(own: pd.DataFrame, regions: pd.DataFrame, changes: pd.DataF
     parts = [("all", own)] + [(str(kind), part) for kind, part in own.groupby(kinds, sort=False)]
     rows = []
     for site, part in parts:
-        its = of_cases(regions, part, _NEEDED), of_cases(changes, part, _NEEDED)
+        its = of_cases(regions, part, NEEDED), of_cases(changes, part, NEEDED)
         proposed = ranked_pairs(part, *its, is_proposal=True)
         rows += [{"site": site, **row} for row in budget_rows(proposed, part, its[0])]
     return rows

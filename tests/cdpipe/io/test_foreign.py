@@ -115,6 +115,10 @@ def test_kitti_as_it_is_distributed(tmp_path: Path) -> None:
     assert worst_m(folder) < 1e-4
     source = open_session(folder)
     np.testing.assert_allclose(np.diff(source.stamps_s), np.diff(STANDING.stamps_s), atol=1e-6)
+    never = [*whole[:1], "2011-02-31 13:02:26.0", *whole[2:]]
+    (folder / "velodyne" / "timestamps.txt").write_text("\n".join(never) + "\n")
+    assert "timestamps.txt:2: 2011-02-31 13:02:26.0: no such date and time" in said(folder)
+    (folder / "velodyne" / "timestamps.txt").write_text("\n".join(whole) + "\n")
     tum = write_trajectory(tmp_path / "t.txt", STANDING.stamps_s, "kitti")
     with pytest.warns(InputWarning, match=r"calib.txt: is not applied to a trajectory from elsewhere"):
         assert worst_m(folder, HowToRead(trajectory=tum)) < 1e-4

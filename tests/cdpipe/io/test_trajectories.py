@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ pytest.importorskip("pypcd4", reason="pip install 'tunnelcd[formats]'")
 pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
 
 from cdpipe.core.errors import InputError, InputWarning
-from cdpipe.io.foreign import HowToRead, read_poses
+from cdpipe.io.foreign import HowToRead, convert_recording, read_poses
 from cdpipe.io.readers import open_session
 from tests.cdpipe.io.foreign_files import (
     MADE,
@@ -21,6 +22,7 @@ from tests.cdpipe.io.foreign_files import (
     odom_T_sensor,
     said,
     worst_m,
+    write_bag,
     write_pcds,
     write_trajectory,
 )
@@ -66,6 +68,22 @@ def test_quaternions_with_w_first_are_noticed(tmp_path: Path) -> None:
     assert "they look like qw first" in said(folder)
     write_trajectory(folder / "t.tum", dense.stamps_s)
     assert worst_m(folder) < 1e-4
+
+
+def test_quaternions_with_w_first_are_noticed_where_a_bag_is_converted(tmp_path: Path) -> None:
+    dense = drive(n_points=40_000, sweep_s=0.0)
+    bag = write_bag(tmp_path / "a.mcap", dense)
+    for order, is_right in (("wxyz", False), ("xyzw", True)):
+        path = write_trajectory(tmp_path / f"{order}.tum", dense.stamps_s, order=order)
+        with nullcontext() if is_right else pytest.raises(InputError, match="they look like qw first"):
+            convert_recording(bag, tmp_path / order, HowToRead(trajectory=path), lambda *_: None)
+
+
+def test_a_file_that_begins_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+    path = write_trajectory(tmp_path / "t.tum", FINE_S)
+    poses = read_poses(path).poses
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    np.testing.assert_array_equal(read_poses(path).poses, poses)
 
 
 def test_times_of_a_trajectory_and_of_its_scans_agree(tmp_path: Path) -> None:

@@ -139,7 +139,8 @@ def test_numbers_that_no_stage_could_use_are_refused(setting: str) -> None:
 
 def test_every_setting_has_a_meaning() -> None:
     rows = settings_table()
-    assert ("extract.voxel_m", 0.65) in [row[:2] for row in rows]
+    assert ("extract.voxel_m", "0.65") in [row[:2] for row in rows]
+    assert ("map.consistency", "none; scan-to-map, graph") in [row[:2] for row in rows]
     assert all(meaning for _, _, meaning in rows)
 
 

@@ -11,6 +11,7 @@ import pytest
 from cdpipe.core.errors import InputError
 from eval.leaderboard.comparison import FIGURES, compare_with_reference, list_lines, write_tables_of
 from eval.leaderboard.reference import find_reference, take_other_methods
+from eval.plans.splits import version_name
 from eval.running.results.run_data import RunData, read_run
 from eval.running.runfolder import write_json
 from eval.scoring.scoring import METRICS_VERSION
@@ -91,10 +92,11 @@ def test_the_table_fits_80_columns(tmp_path: Path) -> None:
 
 def test_without_the_same_pairs_the_reason_is_told(tmp_path: Path) -> None:
     frame = table()
-    sealed = read(tmp_path / "sealed", table((7, 8, 9)), "sealed by x")
-    found = compare_with_reference(own(frame), "mine", [sealed], {})
-    assert found.table["method"].tolist() == ["mine"] and len(found.pairs) == 3
-    assert any("--split sealed" in note for note in found.notes)
+    for version, advice in ((version_name(), "sealed: evaluate with --split"), ("tunnelcd 0.0.1", "with that version")):
+        sealed = read(tmp_path / version, table((7, 8, 9)), f"sealed by {version}")
+        found = compare_with_reference(own(frame), "mine", [sealed], {})
+        assert found.table["method"].tolist() == ["mine"] and len(found.pairs) == 3
+        assert any(version in note and advice in note.replace(f" of {version}", "") for note in found.notes)
     partly = read(tmp_path / "partly", table((2, 3, 4)))
     found = compare_with_reference(own(frame), "mine", [take_other_methods(partly, "mine")], {})
     assert found.table["n_pairs"].tolist() == [2, 2, 2]

@@ -17,7 +17,7 @@ from cdpipe.model.alignment import PathAlignment
 from eval.core.terminal.progress import Silent
 from eval.leaderboard.calls import evaluation_folder, read_call, read_evaluation, require_an_answer
 from eval.leaderboard.given_merge import write_merge
-from eval.leaderboard.submission import pack_submission
+from eval.leaderboard.packing import pack_submission
 from eval.oracles.merge import OracleMerge, align_by_truth
 from eval.running.predictions import add_predictions
 from eval.running.rescoring import rescore
@@ -262,6 +262,19 @@ def test_a_pair_that_cannot_be_made_is_a_failed_row_without_scores(evaluator: Ev
     rows = rows_of(evaluator).set_index("scenario")
     assert rows.loc[ONE_BOX, "error"] == "smoke/one_box does not fit"
     assert np.isnan(rows.loc[ONE_BOX, "region_recall"]) and rows.loc["smoke/unchanged", "region_recall"] == 0.0
+
+
+def test_a_pair_that_cannot_be_mapped_for_its_merge_is_a_failed_row(
+    evaluator: Evaluator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unmapped(*_: object) -> None:
+        raise InputError("revolution 7: no return")
+
+    monkeypatch.setattr("eval.leaderboard.evaluation.write_merge", unmapped)
+    assert evaluator.evaluate().n_failed == 2
+    rows = rows_of(evaluator)
+    assert set(rows["status"]) == {"failed"} and set(rows["error"]) == {"revolution 7: no return"}
+    assert rows.set_index("scenario").loc[ONE_BOX, "region_recall"] == 0.0
 
 
 def test_a_command_and_answers_from_elsewhere_do_not_share_a_name(evaluator: Evaluator, tmp_path: Path) -> None:

@@ -16,8 +16,9 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import path_part
 from eval.leaderboard.calls import digest_method, read_evaluation
+from eval.leaderboard.packing import pack_submission
 from eval.leaderboard.page import write_leaderboard
-from eval.leaderboard.submission import CheckedFile, pack_submission, read_submission, score_again
+from eval.leaderboard.submission import CheckedFile, read_submission, score_again
 from eval.running.runfolder import RunFolder, write_json
 from eval.scoring import scoring
 
@@ -127,6 +128,33 @@ def test_methods_that_were_not_evaluated_are_not_packed(evaluated: RunFolder, tm
         pack_submission(evaluated, "mine", tmp_path / "x.tar")
 
 
+def test_what_would_not_be_read_is_not_packed(
+    evaluated: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def too_large(_: bytes) -> None:
+        raise ValueError("30 MB, more than the 24 MB it may have")
+
+    for name, value in (("parse_json", too_large), ("MOST_BYTES", 9)):
+        with monkeypatch.context() as patched:
+            patched.setattr(f"eval.leaderboard.packing.{name}", value)
+            with pytest.raises(InputError, match=r"mine: 2 pairs are too many for one file \(.*--seeds"):
+                pack_submission(evaluated, "mine", tmp_path / "x.zip")
+    assert not (tmp_path / "x.zip").exists()
+
+
+def test_programs_of_one_name_keep_their_digests(run: RunFolder, tmp_path: Path) -> None:
+    own = run.path / "evaluations" / "mine" / "evaluation.json"
+    document = json.loads(own.read_text())
+    weights = {"/m1/best.pt": "a" * 64, "/m2/best.pt": "b" * 64}
+    write_json(own, {**document, "programs": {**document["programs"], **weights}})
+    for path in run.path.glob("evaluations/mine/*/*.json"):
+        digest = digest_method(read_evaluation(run, "mine"))
+        write_json(path, {**json.loads(path.read_text()), "method_digest": digest})
+    pack_submission(run, "mine", tmp_path / "x.zip")
+    programs = read_submission(tmp_path / "x.zip").content.programs
+    assert (programs["best.pt"], programs["best.pt (2)"]) == ("a" * 64, "b" * 64)
+
+
 PART = {"sha256": "0" * 64, "n_bytes": 1}
 NPZ = "answers/00000/answer.npz"
 HOSTILE: dict[str, tuple[Change, str]] = {
@@ -140,6 +168,7 @@ HOSTILE: dict[str, tuple[Change, str]] = {
     "unknown key": (in_manifest(lambda d: d.update({"x": 1})), "x"),
     "text for a number": (in_row(region_recall="<b>"), "expected a number"),
     "a list for a number": (in_row(region_recall=[1]), "region_recall"),
+    "a share for a truth value": (in_row(is_unchanged_pair=0.5), "expected a truth value"),
     "a figure without end": (in_row(t_total_s=float("inf")), "larger than any figure"),
     "another pair": (in_row(seed=4), "of another pair"),
     "another method": (in_row(variant="tunnelcd"), "another method"),

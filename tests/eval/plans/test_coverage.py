@@ -14,6 +14,11 @@ def test_pairs_with_all_of_their_cells_count() -> None:
     assert measure_coverage({}, [case]).is_whole and explain_unreadable_plan({}) == ""
 
 
+def test_a_folder_of_others_methods_alone_has_no_methods_of_a_plan_to_wait_for() -> None:
+    told = {"plan": {**load_plan("smoke").model_dump(mode="json"), "variants": [], "grid": []}}
+    assert measure_coverage(told, []).is_whole and explain_unreadable_plan(told) == ""
+
+
 def test_a_plan_that_cannot_be_read_here_gives_no_verdict() -> None:
     told = {"plan": {**load_plan("smoke").model_dump(mode="json"), "variants": [{"preset": "elsewhere.yaml"}]}}
     covered = measure_coverage(told, [])

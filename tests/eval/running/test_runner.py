@@ -1,3 +1,4 @@
+import errno
 import json
 import math
 import os
@@ -30,7 +31,14 @@ from eval.running import pair_run
 from eval.running.cell_rows import ITEM_TABLES
 from eval.running.pair_run import Tools
 from eval.running.rescoring import _list_unscored, rescore
-from eval.running.runfolder import RunFolder, open_run_folder, start_run_folder, write_json, write_tables
+from eval.running.runfolder import (
+    NEW_TABLES,
+    RunFolder,
+    open_run_folder,
+    start_run_folder,
+    write_json,
+    write_tables,
+)
 from eval.running.runner import RunOutcome, _provenance
 from eval.running.stages.pair_stages import time_parts
 from eval.scoring.scoring import METRICS_VERSION
@@ -197,6 +205,28 @@ def test_an_infinite_figure_of_a_cell_stands_in_results_alone(smoke_copy: RunFol
     path.write_text(json.dumps(cell))
     assert np.isinf(write_tables(smoke_copy)["n_partial"]).sum() == 1
     assert not np.isinf(pd.read_csv(smoke_copy.path / "summary.csv").select_dtypes("number")).any(axis=None)
+
+
+def test_tables_that_cannot_all_be_written_stay_those_of_before(
+    smoke_copy: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = {path.name: path.read_bytes() for path in smoke_copy.path.glob("*.csv")}
+    path = next(iter(sorted(smoke_copy.path.glob("cells/*/*/*.json"))))
+    cell = json.loads(path.read_text())
+    cell["row"]["n_regions"] = 77
+    path.write_text(json.dumps(cell))
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("eval.running.runfolder._write_csv", full)
+        with pytest.raises(OSError, match="No space left"):
+            write_tables(smoke_copy)
+    assert {path.name: path.read_bytes() for path in smoke_copy.path.glob("*.csv")} == before
+    assert not (smoke_copy.path / NEW_TABLES).exists()
+    assert 77 in write_tables(smoke_copy)["n_regions"].tolist()
+    assert 77 in pd.read_csv(smoke_copy.path / "results.csv")["n_regions"].tolist()
 
 
 def test_maps_beyond_what_pictures_can_show_are_one_line(smoke_copy: RunFolder) -> None:

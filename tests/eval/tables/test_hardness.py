@@ -75,6 +75,14 @@ def test_recall_at_every_step(plan: Plan) -> None:
     assert (low, high) == (0.5, 1.0)
 
 
+def test_no_candidate_and_no_change_at_all_break_no_table(plan: Plan) -> None:
+    results, _, changes = tables(dict.fromkeys(EVERY, ("x", "x")))
+    empty = pd.DataFrame(columns=["scenario", "seed", "variant"])  # as a run writes a table without rows
+    assert hardness_table(results, empty, changes, plan)["recall_at_0.1"].tolist() == [0.0] * 10
+    unchanged = results.assign(status="ok", n_observable=0)
+    assert hardness_table(unchanged, empty, empty, plan)["recall_at_0.1"].isna().all()
+
+
 def test_a_false_region_is_paid_for(plan: Plan) -> None:
     # what finds nothing comes first, and 200 m allow none
     found = hardness_table(*tables(EVERY | {(TALL, "c2c"): ("", "12")}), plan)

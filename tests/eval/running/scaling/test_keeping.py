@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from cdpipe.core.errors import InputError
@@ -15,7 +16,7 @@ from eval.report.page import write_page
 from eval.running.pair_run import Tools
 from eval.running.rescoring import rescore
 from eval.running.runfolder import RunFolder
-from eval.running.scaling.keeping import Keep, list_dropped
+from eval.running.scaling.keeping import Keep, digest_files, list_dropped
 from eval.running.scaling.merging import merge_runs
 from eval.running.scaling.remaking import remade_below, remade_when_asked, remake_pair
 from eval.running.scaling.shards import Shard
@@ -112,6 +113,26 @@ def test_a_pair_that_comes_out_otherwise_is_refused(kept: RunFolder, runner: Run
     with pytest.raises(InputError, match=r"^smoke/one_box 20000: made again, and its files differ .* \(digest"):
         remake_pair(kept, *FIRST, tools=Tools(simulate=other))
     assert n_pairs(kept.path) == 0 and not list(kept.path.glob("pairs/*/.*again"))
+
+
+def test_a_folder_above_a_pair_does_not_change_its_digest(shards: list[Path], tmp_path: Path) -> None:
+    pair = RunFolder(shards[0]).pair(*FIRST)
+    copy = tmp_path / "descriptors" / "run"
+    shutil.copytree(pair, copy)
+    assert digest_files(copy) == digest_files(pair)
+    (copy / "after" / "more").write_text("")
+    assert digest_files(copy) != digest_files(pair)
+
+
+def test_tables_are_written_though_a_pair_of_before_comes_out_otherwise(
+    kept: RunFolder, runner: Runner, plan: Plan
+) -> None:
+    record = list_dropped(kept)[0]
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"digest": "0" * 16}))
+    kept.cell("smoke/unchanged", 20000, VARIANT).unlink()
+    with pytest.raises(InputError, match=r"^smoke/one_box 20000: made again, and its files differ"):
+        runner.run(kept.path, plan, shard=Shard(1, 3), keep="sessions")
+    assert len(pd.read_csv(kept.path / "results.csv")) == 4 and kept.provenance()["finished"]
 
 
 @pytest.mark.parametrize("content", ["", "{}", '{"format": "tunnelcd-dropped"}', "[1]"])

@@ -11,6 +11,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 
 from cdpipe.core.errors import InputError
 from eval.plans.plan import Plan
+from eval.running.pair_run import Pair
 from eval.running.runfolder import RunFolder, write_json
 from eval.running.scaling.mirror import Mirror
 from eval.running.scaling.shards import Shard
@@ -54,6 +55,39 @@ def test_forced_cells_are_forgotten_there_first(tmp_path: Path, runner: Runner, 
         runner.run(tmp_path / "a", plan, shard=PART, mirror=Stopped(url), force=True)
     _, outcome = runner.run(tmp_path / "b", plan, shard=PART, mirror=Mirror(url))
     assert outcome.n_done == 4
+
+
+def test_a_first_copy_that_is_cut_short_is_gone_on_with(tmp_path: Path, runner: Runner, plan: Plan) -> None:
+    url = f"file://{tmp_path}/far"
+    with pytest.raises(KeyboardInterrupt):
+        runner.run(tmp_path / "a", plan, shard=PART, mirror=CutShort(url))
+    Mirror(url).fetch_all(tmp_path / "c")
+    assert len(cells_of(tmp_path / "c")) == 2
+    for name in ("a", "b"):
+        _, outcome = runner.run(tmp_path / name, plan, shard=PART, mirror=Mirror(url))
+        assert outcome.n_kept == {"a": 2, "b": 4}[name]
+
+
+class CutShort(Mirror):
+    def copy_pair(self, run: RunFolder, pair: Pair) -> None:
+        super().copy_pair(run, pair)
+        raise KeyboardInterrupt
+
+
+def test_cells_that_were_written_without_the_copy_are_copied_again(
+    tmp_path: Path, runner: Runner, plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = f"file://{tmp_path}/far"
+    run, _ = runner.run(tmp_path / "a", plan, shard=PART, mirror=Mirror(url))
+    cells = [run.path / name for name in cells_of(run.path)]
+    cells[1].write_text(cells[1].read_text() + " ")
+    copied: list[Path] = []
+    copy_cell = Mirror._copy_cell
+    monkeypatch.setattr(Mirror, "_copy_cell", lambda *told: copied.append(told[2]) or copy_cell(*told))
+    for _ in range(2):
+        runner.run(tmp_path / "a", plan, shard=PART, mirror=Mirror(url))
+        assert copied == [cells[1]]
+    assert (tmp_path / "far" / cells_of(run.path)[1]).read_text() == cells[1].read_text()
 
 
 class Stopped(Mirror):

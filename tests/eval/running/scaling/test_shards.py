@@ -134,6 +134,29 @@ def test_a_cell_that_two_runs_hold_is_kept_once_if_it_is_the_same(
     assert not (tmp_path / "run" / "pairs").exists()
 
 
+def test_a_cell_that_one_run_holds_without_its_answer_comes_with_that_of_the_other(
+    tmp_path: Path, shards: Sequence[Path], whole: Path
+) -> None:
+    shutil.copytree(shards[0], tmp_path / "rows")
+    shutil.rmtree(tmp_path / "rows" / "answers")
+    for order in ([tmp_path / "rows", whole], [whole, tmp_path / "rows"]):
+        merge_runs(order, tmp_path / "run", keep="answers")
+        assert list(differences(tmp_path / "run", whole)) == []
+        shutil.rmtree(tmp_path / "run")
+
+
+def test_pairs_that_two_runs_simulated_otherwise_are_refused(
+    tmp_path: Path, shards: Sequence[Path], whole: Path
+) -> None:
+    shutil.copytree(shards[0], tmp_path / "other")
+    folders = whole, tmp_path / "other"
+    pair = RunFolder(folders[1]).pair(WORLDS[0], 20000)
+    (pair / "after" / "session.json").write_text((pair / "after" / "session.json").read_text() + " ")
+    with pytest.raises(InputError, match=rf"^{WORLDS[0]} 20000: .* answered different sessions"):
+        merge_runs(folders, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def _edit_cell(folder: Path, change: Callable[[dict], object]) -> None:
     path = folder / "cells" / "smoke__one_box" / "20000" / f"{path_part(VARIANT)}.json"
     cell = json.loads(path.read_text())
