@@ -6,7 +6,7 @@ from .methods.registry import load_method
 from .model.config import PipelineConfig, load_config, preset_names
 from .model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape, SurfaceField, SurfaceRegion
 from .model.types import DescriptorSet, MappedSession, MergedMaps, PointMap, PosedScan, ScanSource
-from .pipeline import Hooks, describe, detect, detect_changes, map_session
+from .pipeline import Hooks, describe, detect, detect_changes, map_session, require_usable
 
 __all__ = [
     "ChangeRegions",
@@ -35,6 +35,7 @@ __all__ = [
     "open_session",
     "preset_names",
     "read_answer",
+    "require_usable",
     "save_report",
     "write_answer",
 ]

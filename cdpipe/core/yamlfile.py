@@ -139,9 +139,7 @@ def validate(model: type[ModelT], document: Document) -> ModelT:
         InputError: One line per mistake, `file:line: key = value: rule; did you mean …`, and the number of those beyond
             100; of more than 50,000 the number alone.
     """
-    if not isinstance(document.value, dict):
-        found = "nothing in it" if document.value is None else type(document.value).__name__
-        raise InputError(f"{document.source}: expected keys and values, got {found}")
+    _require_keys(document)
     try:
         return model.model_validate(document.value)
     except ValidationError as error:
@@ -157,15 +155,42 @@ def validate(model: type[ModelT], document: Document) -> ModelT:
         raise InputError("\n".join(dict.fromkeys(lines))) from error
 
 
+def _require_keys(document: Document) -> None:
+    if not isinstance(document.value, dict):
+        found = "nothing in it" if document.value is None else type(document.value).__name__
+        raise InputError(f"{document.source}: expected keys and values, got {found}")
+
+
 def setting_lines(settings: Iterable[str] | Mapping[str, Any]) -> list[str]:
-    """Return settings, given as lines, as `{"a.b": value}` or as `{"a": {"b": value}}`, as `a.b=value` lines."""
+    """Return settings, given as lines, as `{"a.b": value}` or as `{"a": {"b": value}}`, as `a.b=value` lines.
+
+    Values may be paths and numbers of numpy.
+
+    Raises:
+        InputError: A value is none that a file could hold.
+    """
     if not isinstance(settings, Mapping):
         return list(settings)
     lines: list[str] = []
     for key, value in settings.items():
-        inner = setting_lines(value) if isinstance(value, Mapping) else []
-        lines += [f"{key}.{line}" for line in inner] if inner else [f"{key}={json.dumps(value)}"]
+        inner = {f"{key}.{name}": part for name, part in value.items()} if isinstance(value, Mapping) else {}
+        lines += setting_lines(inner) if inner else [f"{key}={_as_text(key, value)}"]
     return lines
+
+
+def _as_text(key: str, value: Any) -> str:
+    def plain(part: Any) -> Any:
+        if isinstance(part, Path):
+            return str(part)
+        if hasattr(part, "item"):  # of numpy, which completion of names in a shell does not wait for
+            return part.item()
+        raise TypeError
+
+    try:
+        return json.dumps(value, default=plain)
+    except (TypeError, ValueError) as error:
+        told = f"{_brief(value)}: expected text, a path, a number, true or false, or a list of these"
+        raise InputError(f"setting {key} = {told}") from error
 
 
 def apply_settings(document: Document, settings: Iterable[str]) -> Document:
@@ -174,8 +199,10 @@ def apply_settings(document: Document, settings: Iterable[str]) -> Document:
     An item of a list goes by its `name`: `props.barrel.size_m=[1, 1, 1]`.
 
     Raises:
-        InputError: A setting has no "=", is not YAML, or names an item that its list lacks.
+        InputError: The document holds no keys; or a setting has no "=", is not YAML, or names an item that its list
+            lacks.
     """
+    _require_keys(document)
     value = deepcopy(document.value)
     origins = dict(document.origins)
     for setting in settings:

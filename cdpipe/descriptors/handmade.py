@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, require_shape
-from cdpipe.core.geometry.voxel import cell_keys
+from cdpipe.core.geometry.voxel import cell_keys, max_coordinate_m
 
 # Raised when the vectors change, so that stored ones are recomputed.
 VERSION = 1
@@ -72,7 +72,9 @@ def solid(points_sensor: Float64Array) -> Vectors:
         q (40,) of unit length, and w (64,) of zero mean and unit length; zeros for an empty or uniform scan.
     """
     require_shape("points_sensor", points_sensor, (None, 3))
-    x, y, z = _cell_means(points_sensor, SOLID_VOXEL_M).T
+    # what some sensors write where nothing returned: no cell has a number there
+    is_near = (np.abs(points_sensor) < max_coordinate_m(SOLID_VOXEL_M)).all(axis=1)
+    x, y, z = _cell_means(points_sensor if is_near.all() else points_sensor[is_near], SOLID_VOXEL_M).T
     across_m = np.hypot(x, y)
     row = np.floor((np.arctan2(z, across_m) / SOLID_ELEVATION_RAD + 1) * (SOLID_ROWS / 2)).astype(np.int64)
     inside = (row >= 0) & (row < SOLID_ROWS)

@@ -14,13 +14,13 @@ from cdpipe.extract.crops import SESSIONS, Crops
 from cdpipe.extract.moves import find_moves
 from cdpipe.extract.remains import is_heap, is_part_of_remainder
 from cdpipe.extract.shape import column_volume_m3, ground_heights, upright_box
+from cdpipe.mapping.reach import FINE_SHARE
 from cdpipe.model.report import ChangedObject, ObjectShape
 from cdpipe.model.types import MergedMaps, PointMap, SessionName
 
 _BLOCK_RETURNS = 1 << 22
 # Shapes use the means of the returns in cells of 1/4 voxel. Cells with fewer returns are dropped as noise, unless less
 # than this share of the cells would remain.
-_FINE_SHARE = 4
 _RETURNS_PER_CELL = 3
 _LEAST_FULL_CELLS = 0.2
 # Margin of an object's surroundings, and distance that still is the object.
@@ -170,7 +170,7 @@ def _fine_points(point_map: PointMap, returns: Int64Array) -> Float64Array:
     """Return the (P, 3) means of returns in cells of 1/4 voxel, odom frame, without sparse cells."""
     if len(returns) == 0:
         return np.zeros((0, 3))
-    means, cells = cell_means(point_map.positions_of(returns), point_map.voxel_m / _FINE_SHARE)
+    means, cells = cell_means(point_map.positions_of(returns), point_map.voxel_m / FINE_SHARE)
     is_full = np.bincount(cells) >= _RETURNS_PER_CELL
     return means[is_full] if is_full.mean() >= _LEAST_FULL_CELLS else means
 

@@ -46,6 +46,7 @@ import numpy.typing as npt
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_json, read_npz
 from cdpipe.core.geometry import Float64Array
+from cdpipe.core.whole_file import whole_file
 from cdpipe.io.answer_parts import (
     FORMAT,
     FORMAT_VERSION,
@@ -59,6 +60,7 @@ from cdpipe.io.answer_parts import (
     check_array_types,
     check_document,
     check_offsets,
+    take_scans,
 )
 from cdpipe.model.report import (
     ChangedObject,
@@ -104,9 +106,13 @@ class Answer:
 
 
 def write_answer(folder: Path | str, method: str, report: ChangeReport, until: Until | None = None) -> None:
-    """Write an answer into `folder`, which may exist; answer.json is written last and marks it complete."""
+    """Write an answer into `folder`, which may exist; answer.json is written last and marks it complete.
+
+    That of an older answer goes first: the folder holds one whole answer or none.
+    """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / "answer.json").unlink(missing_ok=True)
     regions, objects = report.regions, report.objects
     arrays = {
         "region_centres_map": regions.centres_map,
@@ -133,7 +139,8 @@ def write_answer(folder: Path | str, method: str, report: ChangeReport, until: U
     if report.surface is not None:
         of_surface = {name: getattr(report.surface, name.removeprefix("surface_")) for name in _OF_SURFACE}
         arrays |= {name: array for name, array in of_surface.items() if array is not None}
-    np.savez_compressed(folder / "answer.npz", allow_pickle=False, **arrays)
+    with whole_file(folder / "answer.npz") as partial, partial.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
     document = {
         "status": "ok",
         "error": "",
@@ -166,7 +173,8 @@ def write_failure(
 ) -> None:
     """Write the record of a case without an answer, with 10,000 letters of its error and the seconds until then."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "answer.npz").unlink(missing_ok=True)
+    for name in ("answer.json", "answer.npz"):
+        (folder / name).unlink(missing_ok=True)
     document: dict[str, Any] = {"status": status, "error": error[:MAX_ERROR], "method": method}
     document |= {"seconds": dict(seconds or {}), "evidence": dict(evidence)}
     document |= {"config": dict(config), "checkpoints": dict(checkpoints or {})}
@@ -189,7 +197,7 @@ def read_answer(folder: Path | str) -> Answer:
         return Answer(*failed, until=document.until, checkpoints=document.checkpoints, extras=document.extras)
     file, n_objects = folder / "answer.npz", len(document.objects)
     stored = read_npz(file, lambda types: check_array_types(file, types, n_objects))
-    arrays = {name: _computable(array) for name, array in stored.items()}
+    arrays = take_scans(file, {name: _computable(array) for name, array in stored.items()})
     check_offsets(file, arrays, n_objects)
     if math.isnan(document.radius_m) != ("region_radii_m" in arrays):
         raise InputError(
@@ -302,10 +310,9 @@ def _numbers(values: Sequence[Any]) -> Float64Array:
 
 
 def _write_json(folder: Path, document: Mapping[str, Any], until: Until | None) -> None:
-    partial = folder / ".answer.json.partial"
     head = {"format": FORMAT, "format_version": FORMAT_VERSION, **({} if until is None else {"until": until})}
-    partial.write_text(json.dumps({**head, **document}, indent=1))
-    partial.replace(folder / "answer.json")
+    with whole_file(folder / "answer.json") as partial:
+        partial.write_text(json.dumps({**head, **document}, indent=1))
 
 
 def _join(name: str, empty: npt.NDArray[Any], parts: Sequence[npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:

@@ -119,6 +119,8 @@ OFFSETS = {
     "object_points_odom": "object_point_odom_offsets",
 }
 _MASKS = ("region_is_reported", "region_is_withdrawn", "region_is_forced")
+_SCANS = ("before_keyframe_scans", "after_keyframe_scans")
+_MOST_SCANS = 1e9
 _FIGURE = "figure_"
 _MOST_TOLD = 100
 
@@ -179,6 +181,26 @@ def check_offsets(path: Path, arrays: Mapping[str, npt.NDArray[Any]], n_objects:
         if name in arrays:
             mistakes += _offset_mistakes(offsets, arrays[offsets], name, len(arrays[name]), n_objects)
     _raise_all(path, mistakes)
+
+
+def take_scans(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    """Return the arrays with the scans of keyframes as whole numbers, which some programs write as 3.0.
+
+    Raises:
+        InputError: One line for each array of other numbers.
+    """
+    found, mistakes = dict(arrays), []
+    for name in _SCANS:
+        scans = arrays.get(name)
+        if scans is None or np.issubdtype(scans.dtype, np.integer):
+            continue
+        is_whole = scans.dtype.kind == "f" and (np.abs(scans) <= _MOST_SCANS) & (scans == np.round(scans))
+        if np.all(is_whole):
+            found[name] = scans.astype(np.int64)
+        else:
+            mistakes.append(f"array {name}: expected the whole numbers of scans, from 0 on, got {scans.dtype}")
+    _raise_all(path, mistakes)
+    return found
 
 
 def _raise_all(path: Path, mistakes: Sequence[str]) -> None:

@@ -9,6 +9,7 @@ One file holds one transform, or JSON with one transform for the whole path and 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,24 +18,37 @@ import numpy as np
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import parse_json, read_bytes, require_format
 from cdpipe.core.geometry import Float64Array, make_pose
+from cdpipe.io.answer_parts import FORMAT as ANSWER_FORMAT
 from cdpipe.model.alignment import PathAlignment
 
 FORMAT, FORMAT_VERSION = "tunnelcd-merge", 1
 _EXPECTED = "expected a 4x4 rigid transform, four lines of four numbers or JSON"
 _MOST_BYTES = 100_000_000  # an answer.json is one, too
+_ZERO = (0.0, 0.0, 0.0)
 # Largest difference of an entry from the nearest rotation's: files are rounded to six digits.
 _ROUNDED = 1e-6
 
 
-def read_known_merge(path: Path) -> Float64Array:
+def read_known_merge(path: Path, origins_m: Sequence[Sequence[float]] = (_ZERO, _ZERO)) -> Float64Array:
     """Read a (4, 4) `before_T_after`: four lines of numbers, JSON, or JSON that has it by that name, as answers do.
+
+    Args:
+        path: The file.
+        origins_m: What is subtracted from the positions of the before and of the after session when they are read,
+            metres. A file's transform is between the frames without that, an answer's between those that were read.
 
     Raises:
         InputError: The file is missing, of a newer format, or holds no rigid transform.
     """
     content = read_bytes(path, _MOST_BYTES, _EXPECTED)
     try:
-        return require_rigid(_matrix_of(_parse(path, content)))
+        document = _parse(path, content)
+        before_T_after = require_rigid(_matrix_of(document))
+        if isinstance(document, dict) and document.get("format") == ANSWER_FORMAT:
+            return before_T_after
+        before_m, after_m = (np.asarray(each, dtype=np.float64) for each in origins_m)
+        before_T_after[:3, 3] += before_T_after[:3, :3] @ after_m - before_m
+        return before_T_after
     except (ValueError, TypeError, OverflowError) as error:
         raise InputError(f"{path}: {error}: {_EXPECTED}") from error
 

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.whole_file import whole_file
 from cdpipe.io.answer import write_answer
 from cdpipe.io.ply import write_ply_points
 from cdpipe.model.report import ChangeReport, SurfaceField
+
+# The marker, and what not every answer has: of an older one it would tell what is not in the new one. The last two are
+# written by `tunnelcd detect`.
+_OF_AN_ANSWER = ("answer.json", "surface.csv", "surface.ply", "surface.png", "answer.html")
 
 
 def save_report(report: ChangeReport, folder: Path | str, method: str = "tunnelcd") -> None:
     """Write answer.json and answer.npz, regions.csv, objects.csv and objects.ply.
 
     A report that says how far the rock moved also becomes surface.csv (`ChangeReport.to_pandas`) and surface.ply, the
-    places with their normals, displacement, level of detection and region.
+    places with their normals, displacement, level of detection and region. answer.json, which marks an answer complete,
+    goes first and is written last. What an older answer has beside these goes, too.
 
     Args:
         report: What `detect` returned.
@@ -32,15 +38,25 @@ def save_report(report: ChangeReport, folder: Path | str, method: str = "tunnelc
     points = [np.zeros((0, 3)), *(item.points_map for item in report.objects)]
     owners = [np.zeros(0, np.int32), *(np.full(len(item.points_map), k) for k, item in enumerate(report.objects))]
     try:
-        write_answer(folder, method, report)
-        report.to_pandas("regions").to_csv(folder / "regions.csv", index=False)
-        report.to_pandas("objects").to_csv(folder / "objects.csv", index=False)
-        write_ply_points(folder / "objects.ply", np.concatenate(points), {"object": np.concatenate(owners)})
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in _OF_AN_ANSWER:
+            (folder / name).unlink(missing_ok=True)
+        _write_table(report, "regions", folder)
+        _write_table(report, "objects", folder)
+        with whole_file(folder / "objects.ply") as partial:
+            write_ply_points(partial, np.concatenate(points), {"object": np.concatenate(owners)})
         if report.surface is not None:
-            report.to_pandas("surface").to_csv(folder / "surface.csv", index=False)
-            _write_surface(folder / "surface.ply", report.surface)
+            _write_table(report, "surface", folder)
+            with whole_file(folder / "surface.ply") as partial:
+                _write_surface(partial, report.surface)
+        write_answer(folder, method, report)
     except OSError as error:
         raise InputError(f"{error.filename or folder}: cannot be written: {error.strerror}") from error
+
+
+def _write_table(report: ChangeReport, name: Literal["objects", "regions", "surface"], folder: Path) -> None:
+    with whole_file(folder / f"{name}.csv") as partial:
+        report.to_pandas(name).to_csv(partial, index=False)
 
 
 def _write_surface(path: Path, surface: SurfaceField) -> None:

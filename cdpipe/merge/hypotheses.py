@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cdpipe.core.geometry import Float64Array, Int64Array, invert, transform
+from cdpipe.core.geometry import Float64Array, Int64Array, fit_rigid, invert, transform
 from cdpipe.merge.candidates import Candidate
 from cdpipe.merge.evidence import SurfaceFit, explain_refusal, measure_fit, sample_evenly
 from cdpipe.merge.global_registration import register_globally
@@ -19,7 +19,6 @@ from cdpipe.merge.registration import (
     MIN_SPHERE_POINTS,
     IndexedMap,
     align_by_gicp,
-    fit_rigid,
     motion_between,
     register,
 )

@@ -15,7 +15,9 @@ from time import perf_counter
 
 import numpy as np
 
-from cdpipe.core.geometry import Float64Array, transform, travelled_m
+from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Float64Array, fit_rigid, transform, travelled_m
+from cdpipe.core.geometry.voxel import FINEST_CELL_M, max_coordinate_m
 from cdpipe.mapping.poses.recorded_frames import merge_as_mapped
 from cdpipe.merge.candidates import find_candidates, find_closest_pair, list_tries
 from cdpipe.merge.evidence import explain_refusal
@@ -33,7 +35,6 @@ from cdpipe.merge.refine import refine
 from cdpipe.merge.registration import (
     MIN_SPHERE_POINTS,
     IndexedMap,
-    fit_rigid,
     motion_between,
 )
 from cdpipe.merge.rings import explain_rings, measure_rings
@@ -111,6 +112,9 @@ def take_known_merge(
         after: The after session.
         before_T_after: (4, 4) the known alignment, between the frames of the recorded odometries.
         config: Settings of the merge.
+
+    Raises:
+        InputError: The alignment takes the after session farther than its cells can be numbered.
     """
     start = perf_counter()
     seconds = {"t_index_s": 0.0, "t_merge_s": 0.0, "t_refine_s": 0.0}
@@ -119,6 +123,7 @@ def take_known_merge(
     known_local = None if by_user.is_rigid else by_user
     if known_local is not None:
         before_T_after = fit_rigid(by_user.anchors_odom, by_user.before_T_after)
+    _require_reachable(before_T_after, before.map, after.map)
     merged = MergedMaps(before.map, after.map, before_T_after, known, True, local=known_local, seconds=seconds)
     if not _have_points(before, after, config):
         return merged
@@ -151,6 +156,17 @@ def take_known_merge(
         "t_refine_s": perf_counter() - walked if has_refinement else 0.0,
     }
     return replace(merged, before_T_after=refined, evidence=evidence, local=local, seconds=seconds)
+
+
+def _require_reachable(before_T_after: Float64Array, before: PointMap, after: PointMap) -> None:
+    farthest_m = float(np.abs(transform(before_T_after, after.points)).max(initial=0.0))
+    limit_m = max_coordinate_m(min(FINEST_CELL_M, before.voxel_m / 2))  # columns of objects are half as wide as cells
+    if not farthest_m < limit_m:
+        raise InputError(
+            f"the known merge takes the after session to {farthest_m:.0f} m in the before session's odom frame, where "
+            f"cells can be numbered up to {limit_m:.0f} m: expected the transform between both odom frames as they "
+            "were read: subtract from it what was subtracted from the trajectories, or from both what is common"
+        )
 
 
 def _path_m(point_map: PointMap) -> float:

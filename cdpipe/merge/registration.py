@@ -337,25 +337,6 @@ def solve_point_to_plane(jacobian: Float64Array, distances_m: Float64Array, valu
     return np.linalg.solve(damped, weighted.T @ values_m)
 
 
-def fit_rigid(positions: Float64Array, dst_T_src: Float64Array) -> Float64Array:
-    """Return the (4, 4) rigid transform that best fits several local transforms.
-
-    Each transform moves its position and three points 5 m along the axes; the fit is least squares over all of them.
-    The extra points determine the roll on a straight path.
-
-    Args:
-        positions: (A, 3) where each transform holds, source frame, metres.
-        dst_T_src: (A, 4, 4) local transforms.
-    """
-    probes = positions[:, None] + np.concatenate([np.zeros((1, 3)), 5.0 * np.eye(3)])[None]
-    moved = np.einsum("aij,apj->api", dst_T_src[:, :3, :3], probes) + dst_T_src[:, None, :3, 3]
-    source, target = probes.reshape(-1, 3), moved.reshape(-1, 3)
-    source_centre, target_centre = source.mean(axis=0), target.mean(axis=0)
-    u, _, v = np.linalg.svd((target - target_centre).T @ (source - source_centre))
-    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
-    return make_pose(rotation, target_centre - rotation @ source_centre)
-
-
 def motion_between(one: Float64Array, other: Float64Array, position: Float64Array) -> tuple[float, float]:
     """Return the difference of two (4, 4) transforms at a (3,) source position: metres and radians."""
     shift = transform(one, position[None]) - transform(other, position[None])

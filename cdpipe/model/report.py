@@ -230,7 +230,8 @@ class ChangeReport:
     """The whole answer for one pair of sessions; `str(report)` is one sentence about it.
 
     Attributes:
-        before_T_after: (4, 4) the merge that was used.
+        before_T_after: (4, 4) the merge that was used, between the odom frames as recorded; of one that varies along
+            the path the rigid transform that fits it best.
         evidence: What the merge measured.
         regions: All candidates.
         objects: Objects extracted from the reported regions.

@@ -1,4 +1,4 @@
-from .detection import Merge, Propose, detect, detect_changes, detect_merge, merge_mapped
+from .detection import Merge, Propose, detect, detect_changes, detect_merge, merge_mapped, require_usable
 from .hooks import Done, Hooks, Stage, T
 from .mapping import describe, map_pair, map_session, map_sources
 
@@ -17,4 +17,5 @@ __all__ = [
     "map_session",
     "map_sources",
     "merge_mapped",
+    "require_usable",
 ]

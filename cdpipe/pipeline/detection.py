@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from cdpipe.core.errors import InputError, InputWarning, MergeFailedError
 from cdpipe.core.geometry import Float64Array, Int64Array
+from cdpipe.core.plugins import require_extra
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors.describe import list_checkpoints, load_descriptors, require_weights_are_read, use_threads
 from cdpipe.extract.extract import extract_changes, make_report
@@ -72,11 +73,7 @@ def detect(
     """
     known = None if before_T_after is None else require_rigid(before_T_after)
     config = load_config(preset, settings, site)
-    # report a missing extra, or bad weights, before the mapping
-    load_source(config)
-    require_method(config.surface.method)
-    require_weights_are_read(config)
-    list_checkpoints(config)
+    require_usable(config)
     use_threads(THREADS)
     hooks = hooks or Hooks()
     (before, stored_before), (after, stored_after) = (_open(each, config) for each in (before, after))
@@ -92,6 +89,20 @@ def detect(
     _warn_of_no_level(report.surface, config.surface.method)
     coverage = measure_coverage(report, before.odom_T_sensor, after.odom_T_sensor)
     return replace(report, seconds={**report.seconds, **mapped.seconds}, coverage=coverage)
+
+
+def require_usable(config: PipelineConfig) -> None:
+    """Refuse settings that cannot be run here, before anything is read or mapped.
+
+    Raises:
+        InputError: An extra is missing, or weights are damaged or read by nobody.
+    """
+    load_source(config)
+    require_method(config.surface.method)
+    if config.merge.method == "kiss-matcher":
+        require_extra("kiss", "merge.method = kiss-matcher")
+    require_weights_are_read(config)
+    list_checkpoints(config)
 
 
 def detect_changes(

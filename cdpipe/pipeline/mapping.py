@@ -26,6 +26,7 @@ from cdpipe.io.readers import open_session
 from cdpipe.mapping.airborne import clear_air
 from cdpipe.mapping.counted import CountedScans
 from cdpipe.mapping.mapping import build_map, choose_keyframes
+from cdpipe.mapping.reach import require_cells_reach
 from cdpipe.mapping.session_check import check_session
 from cdpipe.merge.candidates import first_keyframes
 from cdpipe.model.config import PipelineConfig, load_config
@@ -67,6 +68,7 @@ def map_session(source: ScanSource, config: PipelineConfig) -> MappedSession:
         InputError: The session or one of its scans cannot be used; the message names it and a remedy.
     """
     check_session(source, config.map)
+    require_cells_reach(source, config)
     source = clear_air(source, config.map)
     thin_map = build_map(source, config.map)
     descriptors = describe_scans(source, thin_map.keyframe_scans, config.descriptor)
@@ -158,6 +160,7 @@ def map_sources(sources: Sequence[ScanSource], config: PipelineConfig, hooks: Ho
         # check both sessions first: mapping may take minutes
         for source, other in (sources, sources[::-1]):
             check_session(source, config.map, other)
+            require_cells_reach(source, config)
         maps = []
         for name, source in zip(("before", "after"), sources, strict=True):
             on_step = partial(_tell_step, hooks, f"map {name}")

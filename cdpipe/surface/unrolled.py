@@ -18,6 +18,9 @@ def unroll(points: Float64Array, odom_T_sensor: Float64Array) -> tuple[Float64Ar
     passes a place twice, the nearer pass counts. In each metre of chainage the axis lies midway between the walls, and
     between roof and floor.
 
+    A wall has one side on both ways past a turn on the spot, as seen on the longer way (`path_frames`); a bend that is
+    metres wide turns the direction, and swaps left and right. So does a session that is driven the other way.
+
     Args:
         points: (Q, 3) places on the rock all around the drift, odom frame, metres.
         odom_T_sensor: (S, 4, 4) poses of the scans of the session.

@@ -12,6 +12,7 @@ from .grid_index import GridIndex
 from .motion import Motion, make_motion
 from .poses import (
     FARTHEST_M,
+    fit_rigid,
     invert,
     make_pose,
     plane_jacobian,
@@ -37,6 +38,7 @@ __all__ = [
     "Motion",
     "cell_keys",
     "cell_means",
+    "fit_rigid",
     "invert",
     "make_motion",
     "make_pose",

@@ -72,7 +72,8 @@ class BagScans:
         self._topics = [(name, kind, count) for name, kind, count in about["topics"] if count]
         unknown = sorted(set(topics) - {name for name, *_ in self._topics})
         if unknown:
-            raise InputError(f"{path}: --topic {unknown[0]}: not in it: it holds {self._listed()}")
+            way = "; `tunnelcd convert` one of two recordings first if their topics differ" if len(topics) > 1 else ""
+            raise InputError(f"{path}: --topic {unknown[0]}: not in it: it holds {self._listed()}{way}")
         self._topic = self._choose(CLOUD, topics, "PointCloud2")
         ((about, arrays),) = self._reader.read("read_stamps", path=self.name, topic=self._topic)
         self._frame = self._require_one_frame([str(frame) for frame in about["frames"]])

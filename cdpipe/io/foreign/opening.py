@@ -28,6 +28,7 @@ from cdpipe.io.foreign.sniff import FORMATS, guess_format, require_format_name
 from cdpipe.io.foreign.trajectory import Trajectory, poses_at, read_poses, require_times_of_scans
 from cdpipe.io.foreign.whole_map import MapStations
 from cdpipe.io.ply import write_ply_points
+from cdpipe.io.session import is_session
 from cdpipe.io.tum import write_tum
 from cdpipe.mapping.poses.odometry import ODOMETRIES, estimate_cloud_motion
 from cdpipe.mapping.poses.pose_check import check_quaternion_order
@@ -67,6 +68,10 @@ class HowToRead:
             raise InputError(f"--odometry {self.odometry}: expected {' or '.join(ODOMETRIES)}")
         if self.odometry is not None and self.trajectory is not None:
             raise InputError("--trajectory and --odometry both give the poses: leave one out")
+
+    def subtracted_m(self, path: Path) -> tuple[float, float, float]:
+        """Return what is subtracted from the positions of a recording: nothing from a session or estimated poses."""
+        return (0.0, 0.0, 0.0) if is_session(path) or self.odometry is not None else self.origin_m
 
 
 def folder_of_options(folder: Path, how: HowToRead) -> Path:

@@ -76,8 +76,9 @@ class ConsistentScans(WrappedScans):
             yield self._corrected(scan)
 
     def _corrected(self, scan: PosedScan) -> PosedScan:
-        n = 0 if self._is_bent[scan.index] else len(scan.points_sensor)
-        return replace(scan.keep(slice(n)), odom_T_sensor=self._poses[scan.index])
+        if self._is_bent[scan.index]:
+            scan = replace(scan.keep(slice(0)), airborne_sensor=None)
+        return replace(scan, odom_T_sensor=self._poses[scan.index])
 
 
 def make_consistent(

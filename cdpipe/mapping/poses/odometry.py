@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, invert, travelled_m
 from cdpipe.core.geometry.motion import Motion, make_motion, rotation_matrices
-from cdpipe.core.isolation import run_isolated
+from cdpipe.core.isolation import ProcessDiedError, run_isolated
 from cdpipe.sensor.air import find_clear_pixels
 from cdpipe.sensor.ouster import SensorMetadata
 
@@ -73,7 +73,7 @@ def estimate_motion(
         odometry: One of `ODOMETRIES`.
 
     Raises:
-        InputError: A pose is not finite.
+        InputError: A pose is not finite, or the process of GenZ-ICP died.
     """
     frames = (
         _columns_frame(sensor.project(range_mm / 1000.0), _is_clear(range_mm, signal, sensor), column_s)
@@ -100,7 +100,7 @@ def estimate_cloud_motion(
         odometry: One of `ODOMETRIES`.
 
     Raises:
-        InputError: A pose is not finite.
+        InputError: A pose is not finite, or the process of GenZ-ICP died.
     """
     return _register((cloud_frame(points, time_s) for points, time_s in clouds), stamps_s, "scan", odometry)
 
@@ -136,9 +136,14 @@ def _register(frames: Iterable[_Frame], stamps_s: Float64Array, what: str, odome
         for number, frame in enumerate(frames):
             points, time_s = frame.flatten()
             np.savez(stored_scan(Path(folder), number), allow_pickle=False, points=points, time_s=time_s)
-        return np.asarray(
-            run_isolated(register_stored, {"folder": folder, "stamps_s": stamps_s.tolist(), "what": what})
-        )
+        stored = {"folder": folder, "stamps_s": stamps_s.tolist(), "what": what}
+        try:
+            return np.asarray(run_isolated(register_stored, stored))
+        except ProcessDiedError as death:
+            raise InputError(
+                f"the process of GenZ-ICP died ({death}) before {len(stamps_s)} {what}s were registered, as it does "
+                "without memory: take --odometry kiss-icp"
+            ) from death
 
 
 def register_frames(icp: Any, name: str, frames: Iterable[_Frame], stamps_s: Float64Array, what: str) -> Float64Array:

@@ -7,15 +7,20 @@ of the nearest keyframe.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import Float64Array, invert, transform_each
+from cdpipe.core.geometry import Float64Array, fit_rigid, invert, transform_each
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, SurfaceField
 from cdpipe.model.types import PointMap
+
+# Both sessions were in one place where their paths come this near to one another, as evidence `overlap` has it.
+_SHARED_M = 5.0
 
 
 def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) -> ChangeReport:
@@ -23,8 +28,9 @@ def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) 
 
     The report is returned unchanged where both maps have these frames. An object moves as a whole, by the motion of its
     middle, and keeps its size and its upright axis. The alignment at an after keyframe takes what the sensor saw there
-    to the place where it was found. `before_T_after` stays as it was found, because the frames differ from place to
-    place.
+    to the place where it was found. The frames differ from place to place: `before_T_after` is the rigid transform that
+    best fits the alignment at the after keyframes beside the before path, at all of them if none is. It stays as it was
+    found where no pose was made another one.
 
     Args:
         report: In the frames of the maps.
@@ -41,11 +47,18 @@ def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) 
     map_T_keyframe = local @ odom_T_keyframe
     recorded = recorded_T_map(before, map_T_keyframe[:, :3, 3])
     recorded_T_keyframe = odom_T_keyframe if after.recorded_T_sensor is None else after.recorded_T_sensor[scans]
+    recorded_local = recorded @ map_T_keyframe @ invert(recorded_T_keyframe)
+    before_T_after = report.before_T_after
+    if not (_is_as_recorded(before) and _is_as_recorded(after)):
+        gaps_m = np.asarray(cKDTree(before.odom_T_keyframe[:, :3, 3]).query(map_T_keyframe[:, :3, 3])[0])
+        shared = gaps_m <= _SHARED_M if gaps_m.min() <= _SHARED_M else np.ones(len(scans), dtype=np.bool_)
+        before_T_after = fit_rigid(recorded_T_keyframe[shared, :3, 3], recorded_local[shared])
     return replace(
         report,
-        regions=_move_regions(report.regions, recorded_T_map(before, report.regions.centres_map)),
+        before_T_after=before_T_after,
+        regions=_move_regions(report.regions, partial(recorded_T_map, before)),
         objects=tuple(_move_objects(report.objects, before)),
-        local_before_T_after=recorded @ map_T_keyframe @ invert(recorded_T_keyframe),
+        local_before_T_after=recorded_local,
         surface=None if report.surface is None else _move_surface(report.surface, before),
     )
 
@@ -54,8 +67,9 @@ def regions_as_mapped(regions: ChangeRegions, before: PointMap) -> ChangeRegions
     """Return regions in the frame of a before map from those in the frame of its recorded odometry."""
     if before.recorded_T_sensor is None:
         return regions
-    map_T_recorded = _transforms_at(regions.centres_map, _recorded_T_keyframe(before), before.odom_T_keyframe)
-    return _move_regions(regions, map_T_recorded)
+    return _move_regions(
+        regions, lambda places: _transforms_at(places, _recorded_T_keyframe(before), before.odom_T_keyframe)
+    )
 
 
 def merge_as_mapped(before_T_after: Float64Array, before: PointMap, after: PointMap) -> PathAlignment:
@@ -64,7 +78,7 @@ def merge_as_mapped(before_T_after: Float64Array, before: PointMap, after: Point
     What an after keyframe saw lands where the merge puts it. The alignment is the merge itself where both maps have the
     recorded poses.
     """
-    if all(np.array_equal(_recorded_T_keyframe(each), each.odom_T_keyframe) for each in (before, after)):
+    if _is_as_recorded(before) and _is_as_recorded(after):
         return PathAlignment.rigid(before_T_after)
     recorded_T_keyframe, odom_T_keyframe = before_T_after @ _recorded_T_keyframe(after), after.odom_T_keyframe
     map_T_recorded = _transforms_at(recorded_T_keyframe[:, :3, 3], _recorded_T_keyframe(before), before.odom_T_keyframe)
@@ -76,6 +90,10 @@ def recorded_T_map(point_map: PointMap, places_odom: Float64Array) -> Float64Arr
     if point_map.recorded_T_sensor is None:
         return np.repeat(np.eye(4)[None], len(places_odom), axis=0)
     return _transforms_at(places_odom, point_map.odom_T_keyframe, _recorded_T_keyframe(point_map))
+
+
+def _is_as_recorded(point_map: PointMap) -> bool:
+    return np.array_equal(_recorded_T_keyframe(point_map), point_map.odom_T_keyframe)
 
 
 def _recorded_T_keyframe(point_map: PointMap) -> Float64Array:
@@ -91,8 +109,14 @@ def _transforms_at(places: Float64Array, src_T_keyframe: Float64Array, dst_T_key
     return np.asarray(dst_T_keyframe[nearest] @ invert(src_T_keyframe[nearest]))
 
 
-def _move_regions(regions: ChangeRegions, dst_T_src: Float64Array) -> ChangeRegions:
-    return replace(regions, centres_map=transform_each(dst_T_src, regions.centres_map))
+def _move_regions(regions: ChangeRegions, transforms_at: Callable[[Float64Array], Float64Array]) -> ChangeRegions:
+    """Return regions with their centres, and those at which they were proposed, moved each as it holds at its place."""
+    proposed = regions.proposed_centres_map
+    return replace(
+        regions,
+        centres_map=transform_each(transforms_at(regions.centres_map), regions.centres_map),
+        proposed_centres_map=None if proposed is None else transform_each(transforms_at(proposed), proposed),
+    )
 
 
 def _move_surface(surface: SurfaceField, before: PointMap) -> SurfaceField:

@@ -88,7 +88,8 @@ class MergeConfig(GrownSettings):
     min_inlier_share: Share = Field(0.85, description="accept at least this share of inliers in the sphere")
     min_hessian_ratio: Share = Field(0.015, description="smallest to largest translational eigenvalue: degeneracy")
     min_agreement: Share = Field(0.8, description="accept at least this share of inliers along both paths")
-    min_distinctness: Annotated[float, Field(ge=1)] = Field(
+    # without a rival, or a near one, the evidence is 10
+    min_distinctness: Annotated[float, Field(ge=1, le=10)] = Field(
         1.3, description="accept if any other alignment that fits has a residual this many times larger"
     )
     accept_all: bool = Field(False, description="accept every alignment, as FRAME does")

@@ -1,10 +1,11 @@
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pydantic import Field
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.yamlfile import Document, Settings, apply_settings, read_yaml, validate
+from cdpipe.core.yamlfile import Document, Settings, apply_settings, read_yaml, setting_lines, validate
 
 
 class Ball(Settings):
@@ -120,3 +121,26 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 def test_a_list_is_not_a_file_of_settings() -> None:
     with pytest.raises(InputError, match="got list"):
         validate(Box, read_yaml(Path("box.yaml"), "- 1\n"))
+
+
+@pytest.mark.parametrize(
+    ("text", "told"), [("", "nothing in it"), ("# a comment\n", "nothing in it"), ("- a\n", "list")]
+)
+@pytest.mark.parametrize("setting", ["name=a", "spare.radius_m=6"])
+def test_settings_need_a_file_with_keys(text: str, told: str, setting: str) -> None:
+    with pytest.raises(InputError, match=rf"^box\.yaml: expected keys and values, got {told}$"):
+        apply_settings(read_yaml(Path("box.yaml"), text), [setting])
+
+
+def test_settings_may_be_paths_and_numbers_of_numpy() -> None:
+    given = {
+        "file": Path("a b/w.safetensors"), "n": np.int64(3), "on": np.bool_(True), "m": np.float32(0.5),
+        "group": {"list": [np.int8(1), Path("x")]},
+    }  # fmt: skip
+    values = apply_settings(Document("a", {}), setting_lines(given)).value
+    assert values == {"file": "a b/w.safetensors", "n": 3, "on": True, "m": 0.5, "group": {"list": [1, "x"]}}
+    loop: list[object] = []
+    loop.append(loop)
+    for wrong in (object(), {1}, loop, 1j):
+        with pytest.raises(InputError, match=r"^setting group\.n = .*: expected [^\n]*$"):
+            setting_lines({"group": {"n": wrong}})

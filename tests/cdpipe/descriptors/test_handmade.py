@@ -164,6 +164,20 @@ def test_scans_with_nothing_to_tell_give_zeros(method: str) -> None:
         HANDMADE[method](np.zeros((4, 2)))
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_return_that_no_cell_can_number_is_none(method: str) -> None:
+    points = cloud(5)
+    for sentinel in ((1e6, 0.0, 0.0), (0.0, 0.0, -1e9), (1e12, 1e12, 1e12)):
+        for found, expected in zip(
+            HANDMADE[method](np.vstack([points, sentinel])), HANDMADE[method](points), strict=True
+        ):
+            np.testing.assert_array_equal(found, expected)
+    if method == "solid":  # what lies beyond the last ring, and can be numbered, counts as ever
+        farther, ring = (solid(np.vstack([points, (x_m, 0.0, 0.0)]))[0] for x_m in (5e5, 1.3 * MAX_RANGE_M))
+        np.testing.assert_array_equal(farther, ring)
+        assert (farther != solid(points)[0]).any()
+
+
 class _Source:
     name = "test"
     odom_T_sensor = np.stack([np.eye(4)] * 3)

@@ -1,13 +1,19 @@
+import errno
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import yaw_pose
+from cdpipe.core.geometry import make_pose, yaw_pose
+from cdpipe.io import report_files
 from cdpipe.io.answer import read_answer, write_answer, write_failure
+from cdpipe.io.report_files import save_report
+from cdpipe.model.aligned import alignment_of
 from cdpipe.model.report import (
     ChangedObject,
     ChangeRegions,
@@ -324,3 +330,74 @@ def test_of_many_unknown_arrays_the_first_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="array unknown_0 is unknown") as caught:
         read_answer(tmp_path)
     assert len(str(caught.value).split("\n")) < 110
+
+
+def _with_surface() -> ChangeReport:
+    field = SurfaceField(
+        np.zeros((2, 3)), np.tile([0.0, 0.0, 1.0], (2, 1)), np.array([0.1, np.nan]), np.array([0.02, np.nan]),
+        np.array([-1, -1], dtype=np.int32), (), np.array([0.5, 0.7]), np.array([0.0, 90.0]),
+    )  # fmt: skip
+    return replace(_report(), surface=field)
+
+
+def test_a_saved_answer_leaves_nothing_of_an_older_one(tmp_path: Path) -> None:
+    save_report(_with_surface(), tmp_path)
+    assert (tmp_path / "surface.csv").is_file() and (tmp_path / "surface.ply").is_file()
+    (tmp_path / "notes.txt").touch()
+    save_report(_report(), tmp_path)
+    names = {"answer.json", "answer.npz", "regions.csv", "objects.csv", "objects.ply", "notes.txt"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+
+
+@pytest.mark.parametrize("broken", ["savez_compressed", "to_csv", "write_ply_points", "dumps"])
+def test_a_folder_holds_a_whole_answer_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str) -> None:
+    save_report(_with_surface(), tmp_path)
+
+    def fill_the_disk(path: object, *_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    owner = {"savez_compressed": np, "to_csv": pd.DataFrame, "write_ply_points": report_files, "dumps": json}[broken]
+    with monkeypatch.context() as patched:
+        patched.setattr(owner, broken, fill_the_disk)
+        with pytest.raises(InputError, match="cannot be written: No space left"):
+            save_report(_report(), tmp_path)
+    assert not (tmp_path / "answer.json").exists()
+    assert not [path for path in tmp_path.iterdir() if path.name.endswith(".partial")]
+    with pytest.raises(InputError, match=r"answer\.json: missing"):
+        read_answer(tmp_path)
+
+
+def test_a_failure_beside_which_an_answer_stays_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_answer(tmp_path, "paper", _report())
+
+    def fill_the_disk(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(json, "dumps", fill_the_disk)
+    with pytest.raises(OSError, match="No space"):
+        write_failure(tmp_path, "paper", "failed", "", {}, {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def _with_scans(folder: Path, scans: object) -> None:
+    write_answer(folder, "other", _report())
+    arrays = dict(np.load(folder / "answer.npz"))
+    np.savez(folder / "answer.npz", **{**arrays, "after_keyframe_scans": np.asarray(scans)})
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.float16, np.uint8])
+def test_scans_of_keyframes_may_be_whole_numbers_of_any_type(tmp_path: Path, dtype: type) -> None:
+    _with_scans(tmp_path, np.array([0, 5], dtype=dtype))
+    read = read_answer(tmp_path).report
+    assert read is not None
+    local = np.stack([np.eye(4), yaw_pose(0.1, (1.0, 0.0, 0.0))])
+    path = make_pose(translation=np.arange(18.0).reshape(6, 3))
+    alignment = alignment_of(replace(read, local_before_T_after=local), path)
+    np.testing.assert_array_equal(alignment.anchors_odom, [[0.0, 1.0, 2.0], [15.0, 16.0, 17.0]])
+
+
+@pytest.mark.parametrize("scans", [[0.0, 5.5], [0.0, np.nan], [0.0, np.inf], [0.0, 1e300], [False, True]])
+def test_scans_of_keyframes_that_are_no_whole_numbers_are_one_line(tmp_path: Path, scans: list[float]) -> None:
+    _with_scans(tmp_path, scans)
+    with pytest.raises(InputError, match=r"answer\.npz: array after_keyframe_scans: expected the whole [^\n]*$"):
+        read_answer(tmp_path)

@@ -8,6 +8,7 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import make_pose, require_poses, yaw_pose
+from cdpipe.io.foreign import HowToRead
 from cdpipe.io.known_merge import read_known_merge, require_rigid
 
 POSE = yaw_pose(0.3, (4.0, -5.0, 0.25))
@@ -62,3 +63,32 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 def test_an_array_becomes_exactly_rigid() -> None:
     found = require_rigid(ROUNDED)
     require_poses("found", found[None])
+
+
+def test_a_matrix_is_between_the_frames_before_an_origin_is_subtracted(tmp_path: Path) -> None:
+    grid_T_grid = yaw_pose(np.pi / 2, (7.0, 0.0, 1.0))  # (x, y, z) -> (7 - y, x, z + 1)
+    (tmp_path / "T").write_text(json.dumps(grid_T_grid.tolist()))
+    before_m, after_m = (5000.0, 4000.0, 300.0), (4000.0, -5000.0, 299.0)
+    found = read_known_merge(tmp_path / "T", (before_m, after_m))
+    # the after session's (0, 0, 0) as read is (4000, -5000, 299) of the grid, which lands on (5007, 4000, 300)
+    np.testing.assert_allclose(found, yaw_pose(np.pi / 2, (7.0, 0.0, 0.0)), atol=1e-9)
+    # one origin for both, and a session that has none
+    same = read_known_merge(tmp_path / "T", (before_m, before_m))
+    np.testing.assert_allclose(same[:3, 3], (7.0 - 4000.0 - 5000.0, 5000.0 - 4000.0, 1.0), atol=1e-9)
+    one = read_known_merge(tmp_path / "T", ((0.0, 0.0, 0.0), after_m))
+    np.testing.assert_allclose(one[:3, 3], (5007.0, 4000.0, 300.0), atol=1e-9)
+
+
+def test_the_merge_of_an_answer_is_between_what_was_read(tmp_path: Path) -> None:
+    answer = {"format": "tunnelcd-answer", "format_version": 1, "before_T_after": POSE.tolist()}
+    (tmp_path / "answer.json").write_text(json.dumps(answer))
+    origin_m = (5000.0, 4000.0, 300.0)
+    np.testing.assert_allclose(read_known_merge(tmp_path / "answer.json", (origin_m, origin_m)), POSE, atol=1e-12)
+
+
+def test_an_origin_is_subtracted_from_positions_that_were_recorded_alone(tmp_path: Path) -> None:
+    origin_m = (5000.0, 4000.0, 300.0)
+    assert HowToRead(origin_m=origin_m).subtracted_m(tmp_path) == origin_m
+    assert HowToRead(origin_m=origin_m, odometry="kiss-icp").subtracted_m(tmp_path) == (0.0, 0.0, 0.0)
+    (tmp_path / "session.json").touch()
+    assert HowToRead(origin_m=origin_m).subtracted_m(tmp_path) == (0.0, 0.0, 0.0)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.errors import InputWarning
+from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, yaw_pose
 from cdpipe.io.ply import read_ply_points
 from cdpipe.merge import merge
@@ -472,3 +472,11 @@ def test_the_real_pair_is_solved() -> None:
     error = invert(true) @ register(source, target, np.eye(4), MergeConfig())
     assert np.linalg.norm(error[:3, 3]) < 0.02
     assert np.degrees(Rotation.from_matrix(error[:3, :3]).magnitude()) < 0.5
+
+
+def test_a_known_merge_beyond_what_cells_can_number_is_refused(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array
+) -> None:
+    utm = make_pose(translation=(500_000.0, 0.0, 0.0)) @ true_before_T_after
+    with pytest.raises(InputError, match=r"^the known merge .*to 500\d\d\d m.* up to 52429 m: expected .*[^\n]$"):
+        take_known_merge(tunnel_before, tunnel_after, utm, CONFIG)

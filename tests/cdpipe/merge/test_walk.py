@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cdpipe.core.geometry import Float64Array, make_pose, transform
-from cdpipe.merge.registration import IndexedMap, fit_rigid, motion_between
+from cdpipe.core.geometry import Float64Array, fit_rigid, make_pose, transform
+from cdpipe.merge.registration import IndexedMap, motion_between
 from cdpipe.merge.walk import Step, choose_evenly, is_shared, walk
 from cdpipe.model.config import MergeConfig
 from cdpipe.model.types import MappedSession

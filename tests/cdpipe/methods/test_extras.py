@@ -10,11 +10,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, make_pose, stream, transform, yaw_pose
 from cdpipe.methods.dufomap import dufomap
 from cdpipe.methods.m3c2 import Distances, m3c2
 from cdpipe.methods.m3c2_ep import detection_levels, m3c2_ep
-from cdpipe.methods.octomap import octomap
+from cdpipe.methods.octomap import near_origin, octomap
 from cdpipe.methods.whole_map import PlacedMaps
 from cdpipe.model.config import M3C2EPConfig, load_config
 from cdpipe.model.report import ChangeReport
@@ -263,6 +264,22 @@ def test_octomap_by_hand(empty: PointMap) -> None:
     assert is_free("after", "before") == is_free("before", "after") == [True, True, True, False, False]
     assert is_free("after", "before", far) == [True, True, True, False, False]
     assert not any(is_free("after", "before", maps=short))
+
+
+def test_octomap_moves_its_origin_where_the_voxels_would_not_hold_the_map(empty: PointMap) -> None:
+    # voxels of 0.01 m reach 327 m to either side; the room is 10 m long
+    def origin_at(away_m: float, voxel_m: float = 0.01) -> list[float]:
+        poses = make_pose(translation=(away_m, 0.0, 0.0)) @ empty.odom_T_sensor
+        moved = replace(empty, points=empty.points + np.array([away_m, 0.0, 0.0]), odom_T_sensor=poses)
+        return near_origin(moved, voxel_m, "before").tolist()
+
+    low, high = empty.points.min(axis=0), empty.points.max(axis=0)
+    assert origin_at(300.0) == [0.0, 0.0, 0.0]
+    path = empty.odom_T_sensor[:, :3, 3]
+    np.testing.assert_allclose(np.array(origin_at(400.0)) - [400.0, 0.0, 0.0], (low + high) / 2, atol=0.006)
+    np.testing.assert_allclose(np.array(origin_at(2000.0)) - [2000.0, 0.0, 0.0], path.mean(axis=0), atol=0.006)
+    with pytest.raises(InputError, match=r"^octomap\.voxel_m = 0\.0001: the before session is 1\d m across, .* 7 m of"):
+        origin_at(0.0, voxel_m=0.0001)
 
 
 @needs("octomap")

@@ -194,3 +194,17 @@ def test_a_radius_that_is_no_number_is_told_of_both_kinds_of_value() -> None:
     with pytest.raises(InputError, match=r"radius_m = 'abc': input should be a length in metres, above 0, or 'width'"):
         load_config("tunnelcd", ["query.radius_m=abc"])
     assert load_config("tunnelcd", ["query.radius_m=width"]).query.radius_m == "width"
+
+
+def test_no_merge_can_be_more_distinct_than_10() -> None:
+    assert load_config("tunnelcd", {"merge.min_distinctness": 10}).merge.min_distinctness == 10
+    with pytest.raises(InputError, match=r"^--set: merge\.min_distinctness = 10\.1: .*less than or equal to 10$"):
+        load_config("tunnelcd", {"merge.min_distinctness": 10.1})
+
+
+def test_an_empty_preset_with_settings_is_refused_in_one_line(tmp_path: Path) -> None:
+    for text in ("", "# nothing\n", "- a\n"):
+        (tmp_path / "p.yaml").write_text(text)
+        for settings in ([], ["seed=1"], ["query.radius_m=6"]):
+            with pytest.raises(InputError, match=r"^[^\n]*p\.yaml: expected keys and values, got [^\n]*$"):
+                load_config(str(tmp_path / "p.yaml"), settings)

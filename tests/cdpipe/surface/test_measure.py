@@ -204,6 +204,22 @@ def test_a_path_that_comes_back_counts_on() -> None:
     assert unroll(np.zeros((0, 3)), PATH)[0].shape == (0,)
 
 
+@pytest.mark.parametrize(("wide_m", "back_deg"), [(0.4, 90.0), (6.0, -90.0)], ids=["on the spot", "by a bend"])
+def test_a_wall_keeps_its_side_past_a_turn_on_the_spot(wide_m: float, back_deg: float) -> None:
+    ahead_m, half = np.arange(0.0, 40.0, 0.25), wide_m / 2
+    turn = np.arange(0.0, np.pi, 0.25 / max(half, 0.5))
+    out = np.column_stack([ahead_m, 0 * ahead_m])
+    bend = np.column_stack([40.0 + half * np.sin(turn), half - half * np.cos(turn)])
+    back = np.column_stack([ahead_m[:80:-1], np.full(79, wide_m)])
+    path = np.concatenate([out, bend, back])
+    session = make_pose(translation=np.column_stack([path, np.zeros(len(path))]))
+    # beside the way out, and beside the way back, which is shorter: to the north and to the south
+    north_m = np.array([0.1, -0.1, wide_m + 0.1, wide_m - 0.1])
+    places = np.column_stack([np.full(4, 30.1), north_m, np.zeros(4)])
+    np.testing.assert_allclose(unroll(places, session)[1], [90.0, -90.0, back_deg, -back_deg], atol=1e-6)
+    np.testing.assert_allclose(unroll(places, session[::-1])[1], [-90.0, 90.0, -back_deg, back_deg], atol=1e-6)
+
+
 def test_a_region_that_two_passes_share_has_the_place_of_its_middle() -> None:
     beside = make_pose(translation=np.array([0.0, -1.0, 0.0])) @ PATH[::-1]
     y_m, x_m = (each.ravel() for each in np.meshgrid(np.arange(-1.4, 0.5, 0.1), np.arange(3.0, 5.0, 0.1)))

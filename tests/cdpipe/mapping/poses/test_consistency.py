@@ -13,6 +13,7 @@ from cdpipe.mapping.poses import consistency
 from cdpipe.mapping.poses.consistency import make_consistent
 from cdpipe.mapping.poses.scan_registration import spread
 from cdpipe.model.config import MapConfig, load_config
+from cdpipe.model.types import PosedScan
 from tests.cdpipe.conftest import CloudScans, scanned
 
 JITTER_M, JITTER_RAD = 0.05, 0.005
@@ -259,3 +260,17 @@ def test_presets_of_the_paper_map_with_the_recorded_poses() -> None:
     for preset in ("paper", "paper-topn", "paper-paired", "scan-context", "solid", "frame"):
         assert "consistency" not in load_config(preset).model_dump()["map"], preset
     assert load_config("tunnelcd").model_dump()["map"]["consistency"] == "graph"
+
+
+def test_a_bent_scan_does_not_tell_of_its_mist_either(tunnel: CloudScans) -> None:
+    class Misty(CloudScans):
+        def scan(self, index: int) -> PosedScan:
+            return replace(super().scan(index), airborne_sensor=np.array([[2.0, 0.0, 0.0]]))
+
+    clouds = [tunnel.scan(index).points_sensor for index in range(2)]
+    source = Misty("misty", tunnel.odom_T_sensor[:2], clouds)
+    scans = consistency.ConsistentScans(source, source.odom_T_sensor, np.array([True, False]))
+    for bent, kept in (list(scans.scans()), [scans.scan(0), scans.scan(1)]):
+        assert len(bent.points_sensor) == 0 and bent.airborne_sensor is None
+        assert len(kept.points_sensor) == len(clouds[1])
+        np.testing.assert_array_equal(kept.airborne_sensor, [[2.0, 0.0, 0.0]])

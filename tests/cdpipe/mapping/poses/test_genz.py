@@ -1,8 +1,11 @@
 """GenZ-ICP: the way through a room, the same bytes whatever the process registered before, and one line without it."""
 
 import importlib.util
+import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,3 +48,13 @@ def test_without_the_package_one_line_says_what_to_install(tmp_path: Path, monke
         open_recording(tmp_path, HowToRead(odometry="genz-icp"), lambda stage, done, total: None)
     with pytest.raises(InputError, match="--odometry lio: expected kiss-icp or genz-icp"):
         HowToRead(odometry="lio")
+
+
+def _die(document: Any) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_death_of_its_process_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cdpipe.mapping.poses.genz.register_stored", _die)
+    with pytest.raises(InputError, match=r"^the process of GenZ-ICP died \(signal 9\) before 3 scans [^\n]*$"):
+        estimate_cloud_motion(((np.ones((4, 3)), None) for _ in range(3)), np.arange(3.0), "genz-icp")

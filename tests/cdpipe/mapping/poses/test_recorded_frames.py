@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, travelled_m
+from cdpipe.core.geometry import Float64Array, invert, make_pose, stream, transform, travelled_m, yaw_pose
 from cdpipe.mapping.poses.recorded_frames import merge_as_mapped, regions_as_mapped, report_as_recorded
 from cdpipe.merge.merge import take_known_merge
 from cdpipe.model.config import ExtractConfig, MergeConfig, PipelineConfig, QueryConfig
@@ -141,3 +142,58 @@ def test_answers_of_the_pipeline_are_in_the_recorded_frames(
     proposed = replace(expected.regions, is_withdrawn=None)
     given = detect_changes(before, after, CONFIG, propose=lambda scans, radii_m: proposed)
     assert {item.kind for item in given.objects} == {item.kind for item in report.objects}
+
+
+def test_proposed_centres_move_each_by_its_own_keyframe(
+    report: ChangeReport, tunnel_before: MappedSession, tunnel_after: MappedSession
+) -> None:
+    before, after = with_recorded(tunnel_before.map, 0), with_recorded(tunnel_after.map, 1)
+    assert before.recorded_T_sensor is not None
+    # every region was proposed at a keyframe, and was then centred elsewhere
+    keyframes = np.arange(len(report.regions.scores)) % len(before.keyframe_scans)
+    regions = replace(report.regions, proposed_centres_map=before.odom_T_keyframe[keyframes, :3, 3])
+    told = report_as_recorded(replace(report, regions=regions), before, after).regions
+    recorded = before.recorded_T_sensor[before.keyframe_scans][keyframes, :3, 3]
+    assert told.proposed_centres_map is not None
+    np.testing.assert_allclose(told.proposed_centres_map, recorded, atol=1e-9)
+    back = regions_as_mapped(replace(report.regions, proposed_centres_map=recorded), before).proposed_centres_map
+    np.testing.assert_allclose(back, regions.proposed_centres_map, atol=1e-9)
+
+
+def test_the_rigid_merge_of_an_answer_is_one_of_the_recorded_frames(
+    report: ChangeReport, tunnel_before: MappedSession, tunnel_after: MappedSession
+) -> None:
+    def turned(point_map: PointMap, yaw_rad: float, shift_m: tuple[float, float, float]) -> PointMap:
+        return replace(point_map, recorded_T_sensor=yaw_pose(yaw_rad, shift_m) @ point_map.odom_T_sensor)
+
+    before = turned(tunnel_before.map, 0.5, (3.0, -2.0, 1.0))
+    after = turned(tunnel_after.map, -0.3, (-1.0, 4.0, 0.0))
+    told = report_as_recorded(replace(report, local_before_T_after=None), before, after)
+    # what the recordings differ by, about the merge of the maps
+    expected = yaw_pose(0.5, (3.0, -2.0, 1.0)) @ report.before_T_after @ invert(yaw_pose(-0.3, (-1.0, 4.0, 0.0)))
+    np.testing.assert_allclose(told.before_T_after, expected, atol=1e-9)
+    # equal poses are no other frame: not a bit changes
+    same = [replace(each.map, recorded_T_sensor=each.map.odom_T_sensor) for each in (tunnel_before, tunnel_after)]
+    np.testing.assert_array_equal(report_as_recorded(report, *same).before_T_after, report.before_T_after)
+
+
+def test_the_rigid_merge_fits_where_both_sessions_were(
+    report: ChangeReport, tunnel_before: MappedSession, tunnel_after: MappedSession
+) -> None:
+    # the after session was alone on the second half of its path, where its odometry went astray
+    poses = tunnel_after.map.odom_T_sensor
+    alone = travelled_m(poses) > travelled_m(poses)[-1] / 2
+    recorded = poses.copy()
+    recorded[alone] = make_pose(translation=(0.0, 9.0, 0.0)) @ poses[alone]
+    after = replace(tunnel_after.map, recorded_T_sensor=recorded)
+    map_T_sensor = report.before_T_after @ poses
+    gaps_m, _ = cKDTree(map_T_sensor[alone, :3, 3]).query(tunnel_before.map.odom_T_sensor[:, :3, 3])
+    kept = np.flatnonzero(gaps_m[tunnel_before.map.keyframe_scans] > 6.0)
+    assert len(kept) > 5
+    before = replace(
+        tunnel_before.map,
+        keyframe_scans=tunnel_before.map.keyframe_scans[kept],
+        views=None,
+    )
+    told = report_as_recorded(replace(report, local_before_T_after=None), before, after)
+    np.testing.assert_allclose(told.before_T_after, report.before_T_after, atol=1e-6)
