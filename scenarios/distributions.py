@@ -7,6 +7,7 @@ named by its `name`, or by its index if it has none. So no draw depends on any o
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -18,6 +19,7 @@ from cdpipe.core.files import Key
 from cdpipe.core.geometry import stream
 
 NAMES = ("uniform", "normal", "integers", "choice")
+_WHOLE = 2**63  # whole numbers are drawn from this far below 0 to this far above, which is excluded
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,16 +195,16 @@ def _is_pair(value: Any) -> bool:
 
 
 def _is_range(value: Any) -> bool:
-    return _is_pair(value) and all(isinstance(part, int) for part in value) and bool(value[0] < value[1])
+    return _is_pair(value) and all(isinstance(part, int) for part in value) and -_WHOLE <= value[0] < value[1] <= _WHOLE
 
 
 _FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "uniform": (
         "[a, b] with a <= b and b - a finite",
-        lambda value: _is_pair(value) and 0 <= value[1] - value[0] < math.inf,
+        lambda value: _is_pair(value) and 0 <= float(value[1]) - float(value[0]) < math.inf,
     ),
     "normal": ("[mean, sigma] with sigma >= 0", lambda value: _is_pair(value) and value[1] >= 0),
-    "integers": ("[a, b] with whole a < b, b excluded", _is_range),
+    "integers": ("[a, b] with whole a < b, b excluded, within 64 bits", _is_range),
     "choice": ("[..] with at least one alternative", lambda value: isinstance(value, list) and len(value) > 0),
 }
 
@@ -226,4 +228,4 @@ def _one_of_rule(options: Any) -> str:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max

@@ -31,6 +31,7 @@ USUAL_ROCK: dict[str, dict[str, Any]] = {
     "shotcrete": {"thickness_m": 0.05, "length_m": 4.0, "width_m": 3.0},
 }
 _FLAT = 20  # the shorter side of a smooth change over its depth, at least: its flank is no steeper than 18 degrees
+_STILL_M = 1e-3  # rock that moves by no more is no change (`sim.displacement.displace.MOVED_M`)
 _Side = Annotated[float, Field(ge=0.5, le=12)]
 
 
@@ -112,6 +113,12 @@ class RockChange(SurfaceChange):
                 f"{told}: depth_m = {self.depth_m:g}: expected -{most_m:g} to {most_m:g} without 0, a twentieth of "
                 f"its shorter side ({shorter_m:g} m)"
             )
+        for key, size_m in (("depth_m", self.depth_m), ("thickness_m", self.thickness_m)):
+            if size_m is not None and abs(size_m) <= _STILL_M:
+                raise ValueError(
+                    f"{told}: {key} = {size_m:g}: rock that moves by {_STILL_M:g} m or less is no change: give more, "
+                    "or leave this change out"
+                )
         return self
 
     @property
@@ -139,7 +146,8 @@ def take_props(scenario: dict[Any, Any]) -> dict[Any, Any]:
     """Return the plain tree of any scenario without its world: only props, without their places between nodes."""
     own = ("family", "description", "score_radius_m", "frozen", "turnover")
     kept = {key: scenario[key] for key in own if key in scenario}
-    return {**kept, "props": [_free(prop) for prop in scenario.get("props") or ()]}
+    props = scenario.get("props") or []
+    return {**kept, "props": [_free(prop) for prop in props] if isinstance(props, list) else props}
 
 
 def _free(prop: Any) -> Any:

@@ -17,7 +17,7 @@ from cdpipe.core.names import visible
 from cdpipe.core.yamlfile import Document, apply_settings, read_yaml, suggest, validate
 from scenarios.catalogue import family_files, family_of, prop_files, prop_names, read_prop
 from scenarios.dangling import Mistake, find_dangling, items_at, mapping_at
-from scenarios.distributions import draw, find_malformed, is_distribution, join_key, merge_trees, option_keys
+from scenarios.distributions import NAMES, draw, find_malformed, is_distribution, join_key, merge_trees, option_keys
 from scenarios.grafted import GraftScenario, take_props
 from scenarios.references import file_keys, find_contradictions
 from scenarios.schema import PROP_KINDS, Prop, Scenario, source_of
@@ -100,6 +100,9 @@ def _require_valid(scenario: Scenario | None, mistakes: list[str]) -> Scenario:
 
 def _draw_scenario(document: Document, seed: int) -> tuple[Scenario | None, list[str]]:
     """Draw a scenario, and return it with every mistake found; None if it does not fit the schema."""
+    if word := next((name for name in NAMES if name in document.value), ""):
+        rule = "a distribution stands in place of a value, not among the keys of a scenario: give it a key"
+        return None, [_format_mistake(document, (word,), rule)]
     mistakes = [_format_mistake(document, key, rule) for key, rule in find_malformed(document.value).items()]
     drawn = draw(document.value, seed)
     tree = dict(drawn.value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import math
 from collections.abc import Iterator, Mapping
@@ -14,7 +15,9 @@ from cdpipe.core.files import Key, require_plain_file
 from cdpipe.sensor.ouster import load_profile
 from scenarios.dangling import Mistake, items_at, mapping_at
 from scenarios.grafted import GraftScenario
-from scenarios.schema import Furniture, Platform, Scenario, Sensor, SessionPlan, Tunnel
+from scenarios.schema import Furniture, Platform, Scenario, Section, Sensor, SessionPlan, Tunnel
+
+_BESIDE = frozenset({"truth", "descriptors"})
 
 
 def file_keys(tree: Any) -> list[tuple[Key, str]]:
@@ -61,13 +64,33 @@ def file_digests(scenario: Scenario) -> dict[str, str]:
     return found
 
 
+def without_paths(drawn: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, Any]:
+    """Return a drawn scenario as a plain tree with the digest of each file in place of its path.
+
+    It is the same from every working folder and on every machine.
+
+    Args:
+        drawn: The scenario, `model_dump(mode="json")`.
+        files: As `file_digests` returns them.
+    """
+    tree = copy.deepcopy(dict(drawn))
+    for key, name in file_keys(tree):
+        holder: Any = tree
+        for part in key[:-1]:
+            holder = holder[part]
+        holder[key[-1]] = files.get(name, name)
+    return tree
+
+
 def _digest(path: Path) -> str:
     """Return the SHA-256 of a file; of a folder, which is a recording, of the names and digests of its files."""
     if not path.is_dir():
         require_plain_file(path)
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
-    files = sorted(each for each in path.rglob("*") if each.is_file() and "truth" not in each.relative_to(path).parts)
+    # the truth of a simulated one, and what `tunnelcd describe` leaves, are not recorded
+    kept = (each for each in path.rglob("*") if _BESIDE.isdisjoint(each.relative_to(path).parts))
+    files = sorted(each for each in kept if each.is_file())
     told = "\n".join(f"{each.relative_to(path).as_posix()} {_digest(each)}" for each in files)
     return hashlib.sha256(told.encode()).hexdigest()
 
@@ -105,20 +128,24 @@ def _start_mistakes(scenario: Scenario) -> Iterator[Mistake]:
 
 
 def _room_mistakes(scenario: Scenario) -> Iterator[Mistake]:
-    drifts = scenario.tunnel.drifts
-    if not drifts:  # nobody has said how wide the drifts of this mesh are
-        return
-    sections = [drift.section or scenario.tunnel.section for drift in drifts]
-    width_m = min(section.width_m for section in sections)
-    roof_m = min(section.height_m for section in sections)
+    """Yield what a platform has no room for in the drifts that its session's route leads through."""
+    section_of: dict[frozenset[str], Section] = {}
+    for drift in scenario.tunnel.drifts:
+        for pair in pairwise(drift.nodes):
+            section_of.setdefault(frozenset(pair), drift.section or scenario.tunnel.section)
     told: set[Key] = set()
     for name, plan in (("before", scenario.before), ("after", scenario.after)):
+        if not plan.route:
+            continue
+        driven = [section_of[frozenset(pair)] for pair in pairwise(plan.route)]
+        width_m = min(section.width_m for section in driven)
+        roof_m = min(section.height_m for section in driven)
         platform: Platform = plan.platform or scenario.platform
         owner: Key = (name, "platform") if plan.platform else ("platform",)
         if width_m <= 2 * platform.clearance_m and owner not in told:
             told.add(owner)
             yield (*owner, "clearance_m"), f"leaves the platform no room in a drift {width_m:.1f} m wide"
-        if plan.trajectory is None and (plan.height_m or platform.sensor_height_m) >= roof_m:
+        if (plan.height_m or platform.sensor_height_m) >= roof_m:
             key: Key = (name, "height_m") if plan.height_m else (*owner, "sensor_height_m")
             yield key, f"the sensor would be above the roof of a drift {roof_m:.1f} m high"
 

@@ -48,6 +48,11 @@ USUAL_MOVERS: dict[str, dict[str, Any]] = {
 }
 
 
+# Half a step is shorter than the leg up to this speed of a person of 1 m, and goes with the square of the height:
+# `sim.movers.person` has steps of the root of 0.387 s times the speed, and legs of 0.484 of the height.
+_FASTEST_MPS = 2.4154
+
+
 class Mover(GrownSettings):
     """Something that moves while a session is recorded; never a change. sim/movers/MOVERS.md has every kind."""
 
@@ -78,4 +83,13 @@ class Mover(GrownSettings):
             raise ValueError(f"mover {self.name!r}: a {self.kind} raises no dust: leave dust_mg_per_m out")
         if self.speed_mps == 0 and self.kind != "person":
             raise ValueError(f"mover {self.name!r}: a {self.kind} that never moves is a prop: give it a speed_mps")
+        return self
+
+    @model_validator(mode="after")
+    def _takes_steps_that_legs_can_take(self) -> Mover:
+        if self.height_m is not None and (self.speed_mps or 0.0) > (fastest_mps := _FASTEST_MPS * self.height_m**2):
+            raise ValueError(
+                f"mover {self.name!r}: speed_mps = {self.speed_mps:g}: a person of height_m = {self.height_m:g} takes "
+                f"steps for at most {fastest_mps:.2f} m/s: lower speed_mps, or raise height_m"
+            )
         return self

@@ -9,6 +9,9 @@ from pydantic import Field, model_validator
 from cdpipe.core.yamlfile import GrownSettings, Settings
 from scenarios.schema.values import Finite, NotNegative, Positive, Reflectivity, Share, Side, SignedShare
 
+FARTHEST_M = 20_000.0  # of rock from the origin: MuJoCo keeps vertices in float32, in steps of 2 mm there
+_FINEST_SHARE = 0.25  # of a cell of the mesh; rock that is rougher on a shorter length is not drawn, and fills memory
+
 
 class Section(Settings):
     """Cross-section of a drift at its nominal size; in a foreign mesh about how wide and high its drifts are."""
@@ -164,4 +167,26 @@ class Tunnel(Settings):
     def _has_walls(self) -> Tunnel:
         if not self.drifts and self.mesh is None:
             raise ValueError("a tunnel needs drifts, or a mesh")
+        return self
+
+    @model_validator(mode="after")
+    def _lies_near_the_origin(self) -> Tunnel:
+        for name, place in self.nodes.items():
+            reach_m = max(map(abs, place))
+            if reach_m > FARTHEST_M:
+                raise ValueError(
+                    f"node {name!r} lies {reach_m / 1000:.0f} km from the origin, where millimetres are lost: subtract "
+                    "one offset from all nodes, places and trajectories"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _is_no_rougher_than_its_mesh(self) -> Tunnel:
+        finest_m = _FINEST_SHARE * self.resolution_m
+        for number, octave in enumerate(self.roughness):
+            if self.mesh is None and octave.amplitude_m > 0 and octave.length_m < finest_m:
+                raise ValueError(
+                    f"roughness.{number}.length_m = {octave.length_m:g}: cells of resolution_m = {self.resolution_m:g} "
+                    f"cannot show it: expected at least {finest_m:g}, or leave this octave out"
+                )
         return self

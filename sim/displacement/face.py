@@ -41,7 +41,7 @@ def advance(walls: TwinWalls, zone: Zone, change: SurfaceChange, seed: int, tunn
     """
     assert change.advance_m is not None
     line, at = zone.line, zone.sample
-    sign = 1.0 if at > len(line.points) / 2 else -1.0
+    sign = -1.0 if at == line.node_samples[0] else 1.0
     axis = sign * np.append(line.headings[at], 0.0)
     node = line.points[at] + [0.0, 0.0, line.height_m[at] / 2]
     to_face_m = _distance(walls, node, axis, change, zone, change.advance_m)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array, Int64Array, stream
 from cdpipe.core.geometry.motion import Motion, make_motion
+from cdpipe.core.geometry.voxel import require_reachable
 from cdpipe.io.tum import motion_beyond, read_trajectory
 from cdpipe.mapping.poses.odometry import Image, estimate_motion
 from cdpipe.sensor.ouster import SensorMetadata
@@ -21,6 +22,9 @@ from scenarios.schema import Odometry
 _WALK_STEP_M = 0.05
 # Poses of a file farther apart than this say nothing about a revolution between them.
 _LONGEST_GAP_S = 1.0
+# The truth numbers the cells that returns fill; no sensor reports more than 524 m.
+_CELL_M = 0.1
+_REACH_M = 530.0
 
 
 def start_pose(true: Motion, start_s: float) -> Float64Array:
@@ -171,9 +175,10 @@ def read_odometry(
         session: "before" or "after".
 
     Raises:
-        InputError: The file is no trajectory, or has no poses near one of the revolutions.
+        InputError: The file is no trajectory, has no poses near one of the revolutions, or is too far from its origin.
     """
     rows, numbers = read_trajectory(path)
+    require_reachable(f"{session}: {path}", float(np.abs(rows[:, 1:4]).max()) + _REACH_M, _CELL_M)
     middle_s = revolution_s - revolution_s[0] + column_offsets_ns[len(column_offsets_ns) // 2] / 1e9
     slack_s = float(column_offsets_ns[-1]) / 1e9
     stamps = rows[:, 0]

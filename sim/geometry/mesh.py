@@ -38,7 +38,9 @@ def move_mesh(mesh: Mesh, dst_T_src: Float64Array) -> Mesh:
 
 
 def join_meshes(meshes: list[Mesh]) -> Mesh:
-    """Return several meshes as one."""
+    """Return several meshes as one; of none, one without triangles."""
+    if not meshes:
+        return Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces).astype(np.int32))

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from cdpipe.core.errors import InputError
+from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, Int64Array
 from sim.graft.part import Part, RecordedRevolution, measured_points
 
@@ -87,7 +87,7 @@ def measure_noise(parts: Sequence[Part]) -> RangeNoise:
     """Measure a recording from twelve revolutions of each of its parts.
 
     Raises:
-        InputError: There are too few returns.
+        ScenarioError: There are too few returns.
     """
     residuals, gaps, bright, steps = [], [], [], []
     for part in parts:
@@ -124,7 +124,7 @@ def _tabulate(
     n_residuals, n_gaps, n_bright = (np.bincount(each, minlength=N_BINS) for each in (of_residual, of_gap, of_bright))
     least = min(_LEAST, int(n_residuals.max(initial=0)))
     if least < 10:
-        raise InputError(f"{parts[0].source.path}: too few returns to tell its noise: give a longer recording")
+        raise ScenarioError(f"{parts[0].source.path}: too few returns to tell its noise: give a longer recording")
     quantiles = np.zeros((N_BINS, len(_SHARES)))
     for number in np.flatnonzero(n_residuals >= least):
         own = np.quantile(residuals[of_residual == number, 1], _SHARES)

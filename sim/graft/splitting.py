@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.errors import InputError
+from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, Int64Array, travelled_m
 from scenarios.grafted import SplitName
 
@@ -45,18 +45,18 @@ def split_scans(odom_T_sensor: Float64Array, how: SplitName, name: str) -> Split
         name: Of the recording, for messages.
 
     Raises:
-        InputError: There is one revolution, or there are no two passes.
+        ScenarioError: There is one revolution, or there are no two passes.
     """
     n_scans = len(odom_T_sensor)
     if n_scans < 2:
-        raise InputError(f"{name}: one revolution makes no pair: give a second recording of the same place")
+        raise ScenarioError(f"{name}: one revolution makes no pair: give a second recording of the same place")
     numbers = np.arange(n_scans)
     if how in ("auto", "passes"):
         cut = _find_passes(odom_T_sensor)
         if cut is not None:
             return Split("passes", numbers[:cut], numbers[cut:])
         if how == "passes":
-            raise InputError(
+            raise ScenarioError(
                 f"{name}: no way is driven twice: no cut leaves two parts of {_PASS_M:g} m of which "
                 f"{_COVERED:.0%} lie within {NEAR_M:g} m of the other: --split alternate or halves"
             )

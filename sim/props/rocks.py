@@ -23,6 +23,7 @@ _SMALLEST_M = 0.05
 _TEMPLATES = 24
 # Area in plan of a fragment, as a share of the square of its size.
 _PLAN_SHARE = 0.5
+_MOST_ROUNDS, _ROUND = 2000, 256  # of draws; a wide and flat pile would need millions of its small fragments
 
 Heights = Callable[[Float64Array], Float64Array]
 
@@ -156,14 +157,17 @@ def draw_sizes(
         generator: Source of the draws.
 
     Returns:
-        Sizes from the largest to the smallest, metres; none below 5 cm, or half the largest of a low pile.
+        Sizes from the largest to the smallest, metres; none below 5 cm, or half the largest of a low pile. They cover
+        less where half a million draws do not do.
     """
     smallest_m = min(_SMALLEST_M, 0.5 * fragment_m)
     if smallest_m >= largest_m:  # a low pile has only fines
         smallest_m = 0.5 * largest_m
     sizes = np.empty(0)
-    while _PLAN_SHARE * np.square(sizes).sum() < coverage * plan_m2:
-        drawn = rosin_rammler(256, fragment_m, generator)
+    for _ in range(_MOST_ROUNDS):
+        if _PLAN_SHARE * np.square(sizes).sum() >= coverage * plan_m2:
+            break
+        drawn = rosin_rammler(_ROUND, fragment_m, generator)
         sizes = np.concatenate([sizes, drawn[(drawn >= smallest_m) & (drawn <= largest_m)]])
     enough = int(np.searchsorted(_PLAN_SHARE * np.cumsum(np.square(sizes)), coverage * plan_m2)) + 1
     return np.asarray(np.sort(sizes[:enough])[::-1][:most])

@@ -141,9 +141,9 @@ def _drift_line(tunnel: Tunnel, index: int, drift: Drift, uses: Counter[str], se
                 f"tunnel.nodes: {a!r} and {b!r} are {span:.2f} m apart: a drift needs 2 m between nodes"
             )
     is_shared = [uses[name] > 1 for name in drift.nodes]
-    points = resample(_round_corners(nodes, spans, is_shared, section.width_m), STEP_M)
-    samples = [int(np.argmin(np.linalg.norm(points - node, axis=1))) for node in nodes]
-    samples[0], samples[-1] = 0, len(points) - 1  # a closed loop has its first node at both ends
+    corners = _round_corners(nodes, spans, is_shared, section.width_m)
+    points = resample(np.concatenate(corners), STEP_M)
+    samples = _node_samples(nodes, corners, points)
     points = points + _meander(
         tunnel, index, points, [s for s, shared in zip(samples, is_shared, strict=True) if shared], seed
     )
@@ -195,8 +195,27 @@ def _extension(inner: Float64Array, last: Float64Array, count: int) -> Float64Ar
     return np.asarray(last + np.arange(1, count + 1)[:, None] * step)
 
 
-def _round_corners(nodes: Float64Array, spans: Float64Array, is_shared: list[bool], width_m: float) -> Float64Array:
-    """Replace every corner that belongs to this drift alone by a quadratic Bezier curve."""
+def _node_samples(nodes: Float64Array, corners: list[Float64Array], points: Float64Array) -> list[int]:
+    """Return the sample nearest to each node, between the middles of the ways to its neighbours.
+
+    A drift may come to one node twice, and pass near another one.
+    """
+    line = np.concatenate(corners)
+    along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    counts = np.array([len(corner) for corner in corners])
+    at = along_m[np.cumsum(counts) - counts + counts // 2] / along_m[-1] * (len(points) - 1)
+    bounds = [0, *((at[1:] + at[:-1]) / 2).astype(int).tolist(), len(points)]
+    samples = [
+        low + int(np.argmin(np.linalg.norm(points[low:high] - node, axis=1)))
+        for node, (low, high) in zip(nodes, pairwise(bounds), strict=True)
+    ]
+    return [0, *samples[1:-1], len(points) - 1]
+
+
+def _round_corners(
+    nodes: Float64Array, spans: Float64Array, is_shared: list[bool], width_m: float
+) -> list[Float64Array]:
+    """Return the line at each node: a quadratic Bezier curve at a corner that belongs to this drift alone."""
     pieces = [nodes[:1]]
     parameter = np.linspace(0.0, 1.0, 33)[:, None]
     for i in range(1, len(nodes) - 1):
@@ -208,7 +227,7 @@ def _round_corners(nodes: Float64Array, spans: Float64Array, is_shared: list[boo
         end = nodes[i] + (nodes[i + 1] - nodes[i]) * (reach_m / spans[i])
         pieces.append((1 - parameter) ** 2 * start + 2 * parameter * (1 - parameter) * nodes[i] + parameter**2 * end)
     pieces.append(nodes[-1:])
-    return np.concatenate(pieces)
+    return pieces
 
 
 def _meander(tunnel: Tunnel, index: int, points: Float64Array, fixed: list[int], seed: int) -> Float64Array:

@@ -13,6 +13,7 @@ import trimesh
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, Int64Array
 from scenarios.schema import MeshFile
+from scenarios.schema.tunnel import FARTHEST_M
 from sim.geometry.mesh import Mesh, drop_flat_faces, drop_unused_vertices
 from sim.geometry.topology import Edges, closed_volume_m3, edges_of, largest_hole, void_winding
 from sim.rock.glb import count_glb
@@ -46,7 +47,6 @@ _PROP_M = (0.02, 15.0)  # longest side
 _LIKELY_DRIFT_M = (1.6, 16.0)
 _LIKELY_TUNNEL_M = (20.0, 5_000.0)
 _LIKELY_PROP_M = (0.15, 6.0)
-_FAR_M = 20_000.0  # MuJoCo keeps vertices in float32: steps of 2 mm there
 
 
 def tunnel_mesh(file: MeshFile) -> Mesh:
@@ -75,7 +75,7 @@ def refuse_tunnel(mesh: Mesh, file: MeshFile) -> None:
         _refuse_length(f"its drifts are {_length(across_m)} across", across_m, file, key, _DRIFT_M, _LIKELY_DRIFT_M)
     _refuse_size(mesh, file, key, _TUNNEL_M, _LIKELY_TUNNEL_M)
     reach_m = float(np.abs(mesh.vertices).max())
-    if reach_m > _FAR_M:
+    if reach_m > FARTHEST_M:
         raise ScenarioError(
             f"{key}: {file.path}: lies {reach_m / 1000:.0f} km from the origin, where millimetres are lost: "
             "move it near the origin, nodes and trajectories with it"

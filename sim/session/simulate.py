@@ -99,7 +99,8 @@ def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progres
     if (out.exists() or out.is_symlink()) and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(f"{out}: exists and is not an empty folder: name a new one or remove it")
     drives, files = _plan(scenario, seed, report)
-    home = out.absolute()
+    # a link to an empty folder is that folder
+    home = Path(os.path.realpath(out)) if out.is_symlink() else out.absolute()
     partial = home.with_name(f".{home.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:

@@ -186,3 +186,25 @@ def test_merging_goes_into_mappings_but_not_into_lists_or_distributions() -> Non
     assert merge_trees(base, over) == {
         "a": {"x": 1, "y": 5}, "l": [9], "d": {"normal": [0, 1]}, "s": {"choice": [1, 2]}, "new": 1,
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("tree", [{"integers": [0, 2**63]}, {"integers": [-(2**63), 5]}, {"uniform": [-1e307, 1e307]}])
+def test_numbers_at_the_limits_are_drawn(tree: dict[str, Any]) -> None:
+    (low, high) = next(iter(tree.values()))
+    assert not find_malformed({"key": tree})
+    assert low <= draw({"key": tree}, 3)["key"] <= high
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        {"integers": [0, 10**20]},
+        {"integers": [-(10**20), 0]},
+        {"uniform": [0, 10**400]},
+        {"uniform": [-(10**308), 10**308]},
+        {"normal": [10**400, 1]},
+    ],
+)
+def test_numbers_beyond_the_limits_are_mistakes(tree: dict[str, Any]) -> None:
+    assert list(find_malformed({"key": tree})) == [("key",)]
+    assert draw({"key": tree}, 3)["key"] is None

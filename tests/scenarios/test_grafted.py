@@ -176,3 +176,13 @@ def test_a_file_that_becomes_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "drive.osf")
     with pytest.raises(InputError, match=r"drive.osf: cannot be read \(it is a device or a pipe\)"):
         file_digests(drawn)
+
+
+@pytest.mark.parametrize("props", ["5", "box", "{name: box}"])
+def test_props_that_are_no_list_are_one_mistake(tmp_path: Path, props: str) -> None:
+    nodes = "tunnel: {nodes: {a: [0, 0, 0], b: [9, 0, 0]}, drifts: [{nodes: [a, b]}]}"
+    path = write(tmp_path, f"{nodes}\nprops: {props}\n")
+    with pytest.raises(ScenarioError) as refused:
+        load_grafted(path, {"sessions": [str(tmp_path / "drive.osf")]}, 0)
+    assert len(str(refused.value).splitlines()) == 1
+    assert f"{path}:2: props = " in str(refused.value)

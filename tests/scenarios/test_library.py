@@ -582,3 +582,25 @@ def test_a_mistake_of_a_repeated_item_is_told_once() -> None:
     assert len(lines) == 2
     assert lines[0] == '--set: props.0.size = 3: unknown key; did you mean "props.0.size_m"?'
     assert re.match(r"--set: props\.8\.aged\.shift_m = 9: ", lines[1])
+
+
+@pytest.mark.parametrize("text", ["uniform: [3, 4]", "choice: [1]"])
+def test_a_distribution_is_no_key_of_a_scenario(tmp_path: Path, text: str) -> None:
+    word = text.partition(":")[0]
+    path = written(tmp_path, f"{WORLD}{text}\n")
+    assert_each_begins(mistakes_of(path), [f":{len(WORLD.splitlines()) + 1}: {word} = ["])
+    with pytest.raises(ScenarioError, match=rf"^--set: {word} = "):
+        load_scenario(written(tmp_path, WORLD, "other.yaml"), 0, [text.replace(": ", "=")])
+
+
+def test_room_is_needed_in_the_drifts_that_are_driven(tmp_path: Path) -> None:
+    narrow = "    - {nodes: [c, d], section: {width_m: 0.9, height_m: 0.7}}\n"
+    text = WORLD.replace("    c: [20, 5, 0]\n", "    c: [20, 5, 0]\n    d: [30, 5, 0]\n")
+    text = text.replace("  section:", f"{narrow}  section:")
+    check_scenario(written(tmp_path, text))
+    driven = text.replace("after: {route: [a, b, c]", "after: {route: [a, b, c, d]")
+    told = mistakes_of(written(tmp_path, driven))
+    assert_each_begins(told, [":1: platform.clearance_m: ", ":1: platform.sensor_height_m: "])
+    (tmp_path / "drive.tum").write_text("0 1 0 1 0 0 0 1\n9 9 0 1 0 0 0 1\n")
+    recorded = "".join(f"{name}: {{trajectory: drive.tum}}\n" for name in ("before", "after"))
+    check_scenario(written(tmp_path, text.split("props:")[0].replace("{uniform: [3, 4]}", "0.9") + recorded))

@@ -74,7 +74,8 @@ def _find_place(
     if change.place.at is not None:
         why = next(iter(reasons))
         raise ScenarioError(f"surface {change.name!r} cannot be at place.at = {list(change.place.at)}: {why}")
-    told = ", ".join(f"{count} times {why}" for why, count in sorted(reasons.items(), key=lambda each: -each[1]))
+    counted = sorted(reasons.items(), key=lambda each: -each[1])
+    told = ", ".join(f"{count} times {why}" for why, count in counted) or "nothing was recorded within reach"
     raise ScenarioError(
         f"surface {change.name!r} finds no place in {sum(reasons.values())} tries ({told}): make it smaller, graft "
         "less, raise reach_m of the recording, or give place.at"
@@ -87,7 +88,7 @@ def _places(change: RockChange, around: Surroundings, seed: int) -> Iterator[Flo
         yield around.nearest(np.array(change.place.at), _FAR_M)
         return
     generator = stream(seed, "graft", change.name, "rock")
-    for _ in range(_DRAWS):
+    for _ in range(_DRAWS if around.n_points else 0):
         yield around.points(generator.integers(around.n_points, size=1))[0]
 
 

@@ -332,3 +332,23 @@ def test_a_scar_that_breaks_into_another_drift_is_refused(make_scenario: Callabl
     with pytest.raises(ScenarioError, match=r"^surface 'scar': another drift lies behind the rock that falls out"):
         moved_walls(beside(4.0))
     assert moved_walls(beside(9.0)).patches[0].kind == "scar"
+
+
+def test_the_face_of_a_stub_shorter_than_its_drift_is_wide_moves_away_from_the_junction(
+    make_scenario: Callable[..., Scenario],
+) -> None:
+    tunnel = Tunnel(
+        nodes={"a": (0, 0, 0), "j": (10, 0, 0), "c": (20, 0, 0), "b": (10, 2.2, 0)},
+        drifts=(Drift(nodes=("a", "j", "c")), Drift(nodes=("j", "b"))),
+        section=Section(shape="rectangle", width_m=5.0, height_m=3.2),
+        resolution_m=0.2,
+    )
+    route = SessionPlan(route=("a", "j", "c"))
+    found = moved_walls(
+        make_scenario(tunnel=tunnel, surface=(change("face", advance_m=2.0),), before=route, after=route)
+    )
+    # the stub ends 2.2 m + half its width from the axis of the other drift, and 2 m of it are new
+    far_m = [found.walls.mesh(session).vertices[:, 1].max() for session in SESSIONS]
+    assert far_m[0] == pytest.approx(4.7, abs=0.3)
+    assert far_m[1] - far_m[0] == pytest.approx(2.0, abs=0.3)
+    assert found.volume_m3(1) < -0.8 * 2.0 * 5.0 * 3.2

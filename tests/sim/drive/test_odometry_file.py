@@ -102,6 +102,18 @@ def test_a_file_that_does_not_cover_the_session_is_refused(
     assert len(str(error.value).splitlines()) == 1
 
 
+def test_positions_beyond_what_cells_of_the_truth_number_are_refused_when_the_file_is_read(
+    tmp_path: Path, sensor: SensorMetadata
+) -> None:
+    stamps_s, middle_s = np.arange(0.0, 3.01, 0.25), np.array([7.0, 8.5, 10.0])
+    limit_m = (2**20 - 1) * 0.1  # 21 bits for each axis
+    assert poses(written(tmp_path / "near.tum", stamps_s, limit_m - 540.0), sensor, middle_s).shape == (3, 4, 4)
+    path = written(tmp_path / "grid.tum", stamps_s, 500_000.0)
+    with pytest.raises(InputError, match=r"^after: .*grid.tum: .*subtract") as error:
+        poses(path, sensor, middle_s)
+    assert len(str(error.value).splitlines()) == 1
+
+
 def test_a_session_has_the_poses_of_its_file_and_the_truth_its_digest(
     tmp_path: Path, make_scenario: Callable[..., Scenario]
 ) -> None:

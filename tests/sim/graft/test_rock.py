@@ -19,8 +19,10 @@ from scenarios.grafted import RockChange
 from sim.graft import Recorded, graft_in_memory, graft_pair
 from sim.graft.part import Part
 from sim.graft.plan import Graft, plan_graft
+from sim.graft.rock.finding import find_rock
 from sim.graft.rock.heights import fit_heights
 from sim.graft.rock.moving import FLATTEST_DEG, RockCounts, move_rock
+from sim.graft.surroundings import Surroundings
 from sim.sensor.rays import revolution_rays
 from sim.session.simulate import HeldPair
 from sim.session.truth import SESSIONS, read_chunk_labels, read_chunk_surface, read_pair_truth
@@ -222,6 +224,8 @@ def test_rock_beside_props_keeps_clear_of_them_and_changes_nothing_of_them(recor
         ({"kind": "convergence", "depth_m": 0.1, "area_m2": 1}, "-0.05 to 0.05 without 0, a twentieth"),
         ({"kind": "convergence", "sector_deg": (40, 120)}, "a convergence has no sector_deg"),
         ({"kind": "shotcrete", "depth_m": 0.05}, "a shotcrete has no depth_m"),
+        ({"kind": "heave", "depth_m": -0.001}, "depth_m = -0.001: rock that moves by 0.001 m or less"),
+        ({"kind": "shotcrete", "thickness_m": 0.0005}, "thickness_m = 0.0005: rock that moves by 0.001 m or less"),
         ({"kind": "heave", "area_m2": 4, "length_m": 2}, "give area_m2, or length_m and width_m"),
         ({"kind": "heave", "place": {"node": "a"}}, "a recording has no nodes"),
     ],
@@ -245,6 +249,21 @@ def test_rock_without_a_place_is_refused(
     monkeypatch.setattr("sim.graft.rock.finding.TRIES", 20)
     with pytest.raises(ScenarioError, match=message):
         graft_rock(recording, {"name": "rock", "kind": "convergence", **told})
+
+
+def test_rock_that_hardly_moves_has_a_truth_that_can_be_read(recording: Session, tmp_path: Path) -> None:
+    rock = RockChange(name="thin", kind="shotcrete", thickness_m=0.00101, area_m2=2)
+    graft_pair(make_graft(surface=(rock,)), SEED, Recorded((recording,)), {}, tmp_path)
+    (thin,) = read_pair_truth(tmp_path).surface_changes
+    assert thin.largest_m == pytest.approx(0.00101, rel=1e-3)
+
+
+def test_a_recording_without_returns_within_reach_has_no_place_for_rock(recording: Session) -> None:
+    empty = make_graft(surface=(RockChange(name="rock", kind="convergence"),))
+    scene = Surroundings([Part("before", recording, np.arange(recording.n_scans), np.eye(4))], 4.0)
+    scene.n_points = 0
+    with pytest.raises(ScenarioError, match=r"^surface 'rock' finds no place in 0 tries \(nothing was recorded"):
+        find_rock(empty, scene, (), SEED)
 
 
 def test_a_given_place_is_the_middle(recording: Session, planned: Graft) -> None:

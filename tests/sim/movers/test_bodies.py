@@ -4,8 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from cdpipe.core.geometry import Float64Array, transform
+from scenarios.schema import Mover
 from sim.movers.body import Moment, measure_extent, sample_moments
 from sim.movers.curtain import Curtain
 from sim.movers.mover import MovingBody
@@ -135,3 +137,15 @@ def test_the_extent_holds_every_moment(kind: str, make_body: MakeBody) -> None:
         for pose in poses:
             moved = transform(pose, corners)
             assert (moved > extent.low).all() and (moved < extent.high).all()
+
+
+@pytest.mark.parametrize("height_m", [1.2, 1.75, 2.2])
+def test_a_person_walks_as_fast_as_half_a_step_reaches_and_no_faster(height_m: float) -> None:
+    # half of a step, the root of speed times 0.3873 s, over 0.985 of the leg, 0.491 of the height
+    fastest_mps = (2 * 0.985 * 0.491 * height_m) ** 2 / (60 * 62 / 98**2)
+    told = {"name": "runner", "kind": "person", "height_m": height_m}
+    assert Mover(**told, speed_mps=0.999 * fastest_mps).height_m == height_m
+    _, poses = walk(Person(height_m, 0.999 * fastest_mps))
+    assert np.isfinite(poses).all()
+    with pytest.raises(ValidationError, match=rf"speed_mps = .*height_m = {height_m:g}"):
+        Mover(**told, speed_mps=1.001 * fastest_mps)

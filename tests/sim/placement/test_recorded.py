@@ -11,11 +11,13 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array, yaw_rad
 from cdpipe.io.session import read_session
+from cdpipe.io.tum import motion_through
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import MeshFile, Platform, Scenario, SessionPlan, Tunnel
 from sim.drive.trajectory import plan_trajectory
 from sim.geometry.mesh import Mesh, box_mesh
 from sim.geometry.raycast import Caster
+from sim.placement import recorded
 from sim.placement.recorded import check_inside, read_drive
 from sim.scene import build_world
 from sim.session.simulate import simulate_pair
@@ -146,3 +148,25 @@ def test_a_foreign_mesh_needs_no_drifts_to_be_driven_through(
         # Noise of 1 cm: every return lies on the hall's six sides.
         inside = true[3][:3, :3] @ session.sensor.project(scan / 1000.0)[scan > 0].T + true[3][:3, 3:]
         assert np.quantile(np.abs(np.abs(inside.T) - (8.0, 2.5, 1.5)).min(axis=1), 0.99) < 0.08
+
+
+def test_a_way_is_looked_at_every_quarter_of_a_metre_however_many_poses_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked_at: list[Float64Array] = []
+
+    def measure(_: Caster, points: Float64Array, directions: Float64Array) -> tuple[Float64Array, np.ndarray]:
+        looked_at.append(points)
+        return np.where(points[:, 0] > 7.6, 0.1, 1.0), np.zeros(len(points), dtype=bool)
+
+    monkeypatch.setattr(recorded, "measure_room", measure)
+    monkeypatch.setattr(recorded, "_CHECKED_AT_ONCE", 7)
+    # 1 m in steps of 1 mm, 5000 poses of standing, 1 m in steps of 1 mm, and 5 m at once
+    x = np.concatenate([np.arange(1000) / 1000, np.ones(5000), 1 + np.arange(1, 1001) / 1000, [7.0]])
+    points = np.column_stack([x, 0 * x, 0 * x])
+    rows = np.column_stack([np.arange(len(x)) / 100.0, points, Rotation.identity(len(x)).as_quat()])
+    numbers = tuple(range(1, len(x) + 1))
+    check_inside(motion_through(rows, 0.0), Caster([box_mesh((1, 1, 1))]), "here", numbers)
+    np.testing.assert_allclose(np.concatenate(looked_at)[:, 0], np.arange(0.0, 7.1, 0.25), atol=2e-3)
+    assert max(map(len, looked_at)) == 7
+    rows[:, 1] += 1.0
+    with pytest.raises(ScenarioError, match=rf"^here:{len(x) - 1}: the sensor at \(7\.75, "):
+        check_inside(motion_through(rows, 0.0), Caster([box_mesh((1, 1, 1))]), "here", numbers)

@@ -13,6 +13,7 @@ from sim.geometry.topology import edges_of
 from sim.props.rocks import (
     Rubble,
     confine,
+    draw_sizes,
     join_rubble,
     lay_fragments,
     passing_share,
@@ -91,3 +92,17 @@ def test_no_rubble_is_no_surface() -> None:
     none = laid_rubble(4).kept(np.zeros(4, bool))
     assert (len(none), none.fragments, len(none.surface().faces)) == (0, (), 0)
     assert len(confine(shift_rubble(none, np.ones(3)), np.zeros(3), np.ones(3))) == 0
+
+
+def test_sizes_are_drawn_in_rounds_of_256_and_a_flat_pile_has_its_share_of_them() -> None:
+    # by hand: what `draw_sizes` gives of a pile that is covered after a few rounds
+    drawn = np.concatenate([rosin_rammler(256, 0.25, generator) for generator in [stream(3, "a")] for _ in range(9)])
+    drawn = drawn[(drawn >= 0.05) & (drawn <= 0.4)]
+    covered_m2 = 0.5 * np.cumsum(drawn**2)
+    plan_m2 = float(covered_m2[700]) - 1e-6
+    found = draw_sizes(plan_m2, 1.0, 0.25, 0.4, 900, stream(3, "a"))
+    np.testing.assert_array_equal(found, np.sort(drawn[:701])[::-1])
+    # 30 x 20 m of fragments of 1 to 2 mm would be 600 million
+    flat = draw_sizes(600.0, 1.5, 0.25, 0.002, 900, stream(3, "b"))
+    assert len(flat) == 900
+    assert (np.diff(flat) <= 0).all() and flat.min() >= 0.001 and flat.max() <= 0.002

@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array
@@ -325,3 +326,30 @@ def test_bad_tunnels_are_refused() -> None:
     double = Tunnel(nodes={"a": (0, 0, 0), "b": (1, 0, 0)}, drifts=(Drift(nodes=("a", "b")),), section=section)
     with pytest.raises(ScenarioError, match=r"'a' and 'b' .*1\.00 m"):
         build_centreline(double, 0)
+
+
+def test_a_drift_that_comes_to_a_node_twice_has_its_edges_in_order() -> None:
+    nodes = {"portal": (0, 0, 0), "j": (20, 0, 0), "x": (35, 10, 0), "y": (20, 20, 0), "end": (5, 12, 0)}
+    section = Section(width_m=3.0, height_m=3.0)
+    for names in (("portal", "j", "x", "y", "j"), ("portal", "j", "x", "y", "j", "end"), ("j", "x", "y", "j")):
+        tunnel = Tunnel(nodes=nodes, drifts=(Drift(nodes=names),), section=section)
+        line = build_centreline(tunnel, SEED)
+        for start, end in pairwise(names):
+            points, _ = line.edge(start, end)
+            # j lies at a sample to half a step, a rounded corner up to half a reach of 6 m beside the line
+            for name, point in ((start, points[0]), (end, points[-1])):
+                assert np.linalg.norm(point - nodes[name]) < (0.06 if name not in "xy" else 3.1)
+            straight_m = float(np.linalg.norm(np.subtract(nodes[end], nodes[start])))
+            way_m = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+            assert straight_m - 7.0 < way_m < straight_m + 0.2
+
+
+def test_a_tunnel_lies_near_the_origin_and_its_rock_is_as_coarse_as_its_mesh() -> None:
+    told = straight(Section()).model_dump()
+    assert Tunnel.model_validate(told | {"nodes": {"a": (19_990.0, 0, 0), "b": (20_000.0, 0, -20_000.0)}})
+    with pytest.raises(ValidationError, match=r"node 'b' lies 500 km from the origin"):
+        Tunnel.model_validate(told | {"nodes": {"a": (19_990.0, 0, 0), "b": (20_000.0, -500_000.0, 0)}})
+    octaves = [{"amplitude_m": 0.1, "length_m": 2.0}, {"amplitude_m": 0.02, "length_m": 0.05}]
+    assert Tunnel.model_validate(told | {"resolution_m": 0.2, "roughness": octaves})
+    with pytest.raises(ValidationError, match=r"roughness\.1\.length_m = 0\.05.* resolution_m = 0\.21"):
+        Tunnel.model_validate(told | {"resolution_m": 0.21, "roughness": octaves})

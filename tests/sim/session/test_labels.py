@@ -11,12 +11,17 @@ from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Aged, Drift, Place, Platform, Prop, Scenario, Section, Sensor, SessionPlan, Shift, Tunnel
 from sim.geometry.mesh import Mesh, box_mesh, move_mesh, point_triangle_distance
 from sim.geometry.raycast import Caster
+from sim.graft.plan import Compared, Surfaces
+from sim.placement.contact import standing_surface
+from sim.placement.placing import Standing
+from sim.props.props import shape_of
 from sim.scene import World, build_world
 from sim.sensor.lidar import scan
 from sim.sensor.rays import Rays, revolution_rays
 from sim.session.labels import Ghost, Returns, list_changes, mark_belonging
 from sim.session.simulate import simulate_pair
-from sim.session.truth import Change, read_pair_truth
+from sim.session.truth import Change, SessionName, read_pair_truth
+from tests.sim.graft.conftest import make_graft
 
 
 def box_at(x: float, y: float, z: float, half_m: float = 0.5) -> Mesh:
@@ -316,3 +321,18 @@ def test_a_ghost_needs_no_closed_surface() -> None:
     ranges_m = np.full((501, 1), 9.0, np.float32)
     assert len(skin.faces) == 2
     assert Ghost(skin).count(rays, ranges_m) == Ghost(box).count(rays, ranges_m) > 100
+
+
+def test_with_nothing_around_a_short_move_every_return_belongs_to_it() -> None:
+    told = {"name": "rail", "kind": "railing", "size_m": (3.0, 0.05, 1.0), "change": "moved"}
+    prop = Prop(**told, shift=Shift(distance_m=0.5, heading_deg=90.0))
+    sides: tuple[tuple[SessionName, float], ...] = (("before", 0.0), ("after", 0.5))
+    standing = [
+        Standing(prop, shape_of(prop, 0), frozenset({session}), make_pose(translation=(0.0, across_m, 0.0)))
+        for session, across_m in sides
+    ]
+    before, after = (Surfaces((standing_surface(item),), np.array([1], np.int32)) for item in standing)
+    tallies = list_changes(make_graft(prop.model_dump()), Compared(standing, before, after))
+    assert [tally.change.group for tally in tallies] == ["partial", "partial"]
+    points = standing_surface(standing[0]).vertices
+    assert all(mark_belonging(tally, points).all() for tally in tallies)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.geometry import Float64Array, transform
 from cdpipe.io.session import Session, read_session
-from scenarios.schema import Odometry, Place, Prop, Scenario, Sensor, SessionPlan
+from scenarios.schema import Odometry, Place, Platform, Prop, Scenario, Sensor, SessionPlan
 from sim.scene import build_world
 from sim.session import simulate
 from sim.session.simulate import simulate_pair
@@ -196,3 +196,16 @@ def test_an_empty_folder_is_a_fine_target(make_scenario: Callable[..., Scenario]
     (tmp_path / "pair").mkdir()
     simulate_pair(make_scenario(), 0, tmp_path / "pair")
     assert sorted(path.name for path in (tmp_path / "pair").iterdir()) == ["after", "before", "truth"]
+
+
+def test_a_link_to_an_empty_folder_is_a_target_that_stays_a_link(
+    make_scenario: Callable[..., Scenario], tmp_path: Path
+) -> None:
+    home = tmp_path / "disk" / "pair"
+    home.mkdir(parents=True)
+    link = tmp_path / "out"
+    link.symlink_to(home)
+    simulate_pair(make_scenario(platform=Platform(scan_spacing_m=8.0)), 0, link)
+    assert link.is_symlink()
+    assert {path.name for path in home.iterdir()} == {"before", "after", "truth"}
+    assert [path.name for path in (tmp_path / "disk").iterdir()] == ["pair"]
