@@ -162,7 +162,7 @@ def _panel(title: str, rows: Sequence[Mapping[str, Any]], looks: Mapping[str, Lo
 
 
 def write_growth(table: Mapping[str, Any], path: Path) -> list[Path]:
-    """Write the measurements as CSV and the chart as PNG beside the JSON file of `path`; return both paths.
+    """Write the measurements as CSV and the chart, if any, as PNG beside the JSON file of `path`; return the paths.
 
     Raises:
         InputError: They cannot be written.
@@ -171,8 +171,9 @@ def write_growth(table: Mapping[str, Any], path: Path) -> list[Path]:
     try:
         with whole_file(csv) as partial:
             pd.DataFrame(table["measured"]).to_csv(partial, index=False, float_format="%.6g")
-        with whole_file(image) as partial:
-            partial.write_bytes(png(picture(draw_growth(table))))
+        if table["rows"]:  # no size of any axis may have been measured
+            with whole_file(image) as partial:
+                partial.write_bytes(png(picture(draw_growth(table))))
     except OSError as error:
         raise unwritable(path, error) from error
-    return [csv, image]
+    return [csv, image] if table["rows"] else [csv]

@@ -12,6 +12,7 @@ import typer
 
 if TYPE_CHECKING:
     from cdpipe.io.foreign import HowToRead
+    from cdpipe.model.config import Site
     from cdpipe.model.types import ScanSource
     from eval.core.terminal.progress import RunProgress
 
@@ -95,6 +96,22 @@ def read_metres(option: str, text: str) -> tuple[float, float, float]:
     if not all(abs(value) <= _FARTHEST_M for value in (x, y, z)):
         raise InputError(f"--{option} {text}: expected three numbers in metres, as 12.5,-1.8,0.9")
     return x, y, z
+
+
+def with_surface(preset: str, settings: Sequence[str], site: Site) -> list[str]:
+    """Return settings that measure displacement: by `planes`, unless the preset or a setting names a method.
+
+    Raises:
+        InputError: A setting says that it is not measured.
+    """
+    import cdpipe
+    from cdpipe.core.errors import InputError
+
+    if cdpipe.load_config(preset, settings, site).surface.method != "none":
+        return [*settings]
+    if any(setting.partition("=")[0].strip() == "surface.method" for setting in settings):
+        raise InputError("--set surface.method=none: displacement is to be measured: leave it out, or name a method")
+    return ["surface.method=planes", *settings]
 
 
 def tell_recordings(

@@ -36,7 +36,8 @@ class _Funnel(TyperGroup):
                 return super().invoke(ctx)
         except KeyboardInterrupt as error:
             kept = None if "--unpack" in sys.argv else _KEPT.get(ctx.invoked_subcommand or "")
-            going_on = f"finished {kept} are kept, the same command goes on from there"
+            again = "the same command without --force" if "--force" in sys.argv else "the same command"
+            going_on = f"finished {kept} are kept, {again} goes on from there"
             told = going_on if kept else "nothing half-written is left"
             sys.stderr.write(f"interrupted; {told}\n")
             raise typer.Exit(130) from error

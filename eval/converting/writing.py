@@ -45,6 +45,19 @@ def write_session(request: Request, out: Path, name: str) -> str:
     return f"{out}: {n_scans} {what}{'' if n_scans == 1 else 's'}, {told}, {_size_mb(out):.1f} MB"
 
 
+def require_map(out: Path, name: str) -> None:
+    """Refuse a format that cannot hold the map of an answer, or that needs an extra which is missing.
+
+    Raises:
+        InputError: It cannot, or the extra is missing.
+    """
+    if not FORMATS[name].is_map:
+        maps = ", ".join(suffix for each in FORMATS.values() if each.is_map for suffix in each.suffixes)
+        raise InputError(f"{out}: an answer becomes a map with scalar fields: name a new file that ends in {maps}")
+    if name == "laz":
+        require_formats(out)
+
+
 def write_answer_map(
     sessions: tuple[ScanSource, ScanSource], answer: Path, out: Path, name: str, cell_m: float, progress: RunProgress
 ) -> str:
@@ -56,13 +69,8 @@ def write_answer_map(
     from cdpipe.io.out.answer_map import gather_answer_map
     from cdpipe.io.out.clouds import write_laz, write_ply
 
-    form = FORMATS[name]
-    if not form.is_map:
-        maps = ", ".join(suffix for each in FORMATS.values() if each.is_map for suffix in each.suffixes)
-        raise InputError(f"{out}: an answer becomes a map with scalar fields: name a new file that ends in {maps}")
-    if name == "laz":
-        require_formats(out)
-    with _output(out, form) as partial:
+    require_map(out, name)
+    with _output(out, FORMATS[name]) as partial:
         cloud = gather_answer_map(sessions, answer, cell_m, progress.stage)
         (write_laz if name == "laz" else write_ply)(partial, cloud)
     n_changed = int((cloud.scalars["change"] > 0).sum())

@@ -67,7 +67,8 @@ def open_recorded(recording: Recording, on_progress: Progress = report_nothing) 
     """Open the recordings of a pair, and find their merge where it is not given.
 
     Raises:
-        InputError: One cannot be read, or the file of the merge holds none, or no merge is found.
+        InputError: One cannot be read, or the file of the merge holds none.
+        ScenarioError: No merge is found.
     """
     with tempfile.TemporaryDirectory(prefix="tunnelcd-graft-") as folder:
         sessions = tuple(
@@ -122,7 +123,7 @@ def _find_merge(sessions: tuple[Session, ...], on_progress: Progress) -> Float64
     """Return `before_T_after` (4, 4) as preset `tunnelcd` finds it.
 
     Raises:
-        InputError: It is refused.
+        ScenarioError: It is refused.
     """
     config, hooks = load_config("tunnelcd"), Hooks(on_progress)
     sources = [RecordedScans(session) for session in sessions]
@@ -130,5 +131,6 @@ def _find_merge(sessions: tuple[Session, ...], on_progress: Progress) -> Float64
         report = detect_merge(*map_pair(sources, config, hooks).value, config, hooks)
     except MergeFailedError as error:
         names = " and ".join(str(session.path) for session in sessions)
-        raise InputError(f"{names}: {error}: give their merge with --before-T-after FILE") from error
+        told = "give their merge: `before_T_after` of the recording, or --before-T-after FILE"
+        raise ScenarioError(f"{names}: {error}: {told}") from error
     return report.before_T_after

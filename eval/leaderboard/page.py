@@ -60,6 +60,17 @@ class Board:
     notes: tuple[str, ...]
 
 
+def require_page(out: Path) -> None:
+    """Refuse what is no name of a page, or holds something else.
+
+    Raises:
+        InputError: It does.
+    """
+    if out.suffix != ".html" or out.is_dir():
+        raise InputError(f"--out {out}: expected the name of a file that ends in .html")
+    require_replaceable(out, _HEAD, "page of `tunnelcd leaderboard`")
+
+
 def write_leaderboard(files: Sequence[CheckedFile], out: Path, reference: Path | None, checked: Sequence[int]) -> None:
     """Write the page.
 
@@ -72,9 +83,7 @@ def write_leaderboard(files: Sequence[CheckedFile], out: Path, reference: Path |
     Raises:
         InputError: Two submissions are of one method on the same pairs, or a file cannot be read or written.
     """
-    if out.suffix != ".html" or out.is_dir():
-        raise InputError(f"--out {out}: expected the name of a file that ends in .html")
-    require_replaceable(out, _HEAD, "page of `tunnelcd leaderboard`")
+    require_page(out)
     boards = [board for group in _group(files) for board in _make_boards(group, reference)]
     told = [
         {"name": each.content.name, "file": each.path.name, "sha256": each.sha256, "content": each.content,

@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 from pydantic import TypeAdapter
 
 from cdpipe.core.errors import InputError, ScenarioError
-from cdpipe.core.whole_file import whole_file
+from cdpipe.core.whole_file import partial_of, whole_file
 from eval.core.cluster import HERE, Where, connected, require_usable
 from eval.core.output import made_parents, make_writable, remove, require_no_links
 from eval.core.terminal.progress import RunProgress, Silent
@@ -151,6 +151,8 @@ def _take_folder(folder: Path, release: Release) -> None:
     for left in folder.glob(f"{_SCRATCH}*"):
         if _LEFT.fullmatch(left.name):
             shutil.rmtree(left, ignore_errors=True)
+    for name in _OWN:
+        remove(partial_of(folder / name))
     here = {path.name for path in folder.iterdir()} - _OWN
     names = {pair.name for pair in release.pairs}
     for kind in (SESSIONS, TRUTH):

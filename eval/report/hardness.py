@@ -68,9 +68,13 @@ def name_breaks(points: pd.DataFrame, variant: str) -> str:
         points: Rows of breaking_points.csv.
         variant: The method.
     """
-    own = records(_with_texts(points[points["is_measured"] & (points["variant"] == variant)]))
+    its = points[points["variant"] == variant]
+    own = records(_with_texts(its[its["is_measured"]]))
     broken = [f"{row['axis']} ({_at(row)})" for row in own if row["step"]]
-    return f"{variant} breaks at {', '.join(broken)}" if broken else f"{variant} breaks nowhere"
+    if broken:
+        return f"{variant} breaks at {', '.join(broken)}"
+    n_left = len(its) - len(own)
+    return f"{variant} breaks nowhere" + (f" on {len(own)} axes, {n_left} are not measured yet" if n_left else "")
 
 
 def _at(row: Mapping[str, Any]) -> str:

@@ -140,7 +140,6 @@ def _draw(data: RunData, views: Views, kept: KeptPage, *, is_slim: bool) -> dict
     content["is_slim"] = is_slim
     content["missing"] = list(dict.fromkeys([*data.left_out, *content["missing"], *content["merge"].missing]))
     content = keep(content, kept)
-    content["missing"] = list(dict.fromkeys([*data.left_out, *content["missing"]]))
     files["index.html"] = render_page("page.html", content | _define(data, content))
     files |= {f"{chart.name}.png": chart.png for chart in content["charts"] if chart.has_png}
     return files

@@ -75,7 +75,7 @@ def rank_pairs(data: RunData, variant: str, pairs: tuple[tuple[str, int], ...]) 
 
 
 def _items(rows: Sequence[Mapping[str, Any]], variant: str, pairs: Iterable[tuple[str, int]]) -> pd.DataFrame:
-    """Return the rows of one variant on some pairs, in their order."""
+    """Return the rows of one variant on some pairs, in their order; none of a table that is there has its columns."""
     wanted = set(pairs)
     kept = [row for row in rows if row["variant"] == variant and (row["scenario"], row["seed"]) in wanted]
-    return pd.DataFrame(kept)
+    return pd.DataFrame(kept or None, columns=list(rows[0]) if rows else None)

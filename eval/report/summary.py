@@ -24,7 +24,7 @@ from eval.running.results.values import text
 from eval.running.runfolder import reported
 from eval.scoring.surface.windows import AREAS_M2
 from eval.tables.columns import Column, fine, select, share, spaced
-from eval.tables.merge_table import ALL_FAMILIES, RIGHT_DEG, RIGHT_M
+from eval.tables.merge_table import ALL_FAMILIES, RIGHT_DEG, RIGHT_M, kinds
 from eval.tables.rows import (
     ALL_DOMAINS,
     DOMAINS,
@@ -207,7 +207,8 @@ def _sentence(data: RunData, merges: pd.DataFrame) -> str:
     own = merges[merges["family"] == ALL_FAMILIES] if len(merges) else merges
     wrong = (numbers(results, "merge_error_m") > RIGHT_M) | (numbers(results, "merge_error_deg") > RIGHT_DEG)
     # where pairs have a kind, a merge of sessions without a common place is wrong too
-    if n_wrong := int(own["n_wrong_accepted"].sum() if len(own) else wrong.sum()):
+    n_of_kinds = int(own["n_wrong_accepted"].sum()) if len(own) else 0
+    if n_wrong := n_of_kinds + int((wrong & (kinds(results) == "")).sum()):
         told = f"{_counted(n_wrong, 'accepted merge')} {'is' if n_wrong == 1 else 'are'} wrong"
         parts.append(f"{told} (over {RIGHT_M:g} m or {RIGHT_DEG:g} deg)")
     verdicts = list(own[own["variant"] == shown_variant(data)]["is_met"]) if len(own) else []

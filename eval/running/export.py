@@ -103,7 +103,7 @@ def list_pairs(run: RunFolder) -> list[Path]:
         )
     pairs = [path.parents[1] for path in sorted(run.path.glob(f"pairs/*/*/{_CHANGES}"))]
     if not pairs:
-        raise InputError(f"{run.path}: holds no simulated pairs: run the plan again, which makes them")
+        raise InputError(f"{run.path}: holds no simulated pairs: run the plan again with --keep sessions")
     return pairs
 
 

@@ -44,6 +44,7 @@ from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
 from scenarios.grafted import GraftScenario
 from scenarios.library import load_scenario
+from scenarios.references import without_paths
 from scenarios.schema import Scenario
 
 if sys.platform != "win32":
@@ -243,8 +244,8 @@ class CellKeys:
         self, seed: int, pair_kind: str, scenario: Scenario | None, files: Mapping[str, str]
     ) -> Callable[[Cell], str]:
         """Return the function that gives the digest of each cell of a pair."""
-        drawn = None if scenario is None else scenario.model_dump(mode="json")
-        shared = {"scenario": drawn, "files": dict(files), "seed": seed, "pair_kind": pair_kind}
+        drawn = None if scenario is None else without_paths(scenario.model_dump(mode="json"), files)
+        shared = {"scenario": drawn, "files": {}, "seed": seed, "pair_kind": pair_kind}
         texts = {name: canonical_json(value) for name, value in shared.items()}
         return lambda cell: digest_parts({**texts, **self._of_method(cell)})
 

@@ -57,6 +57,7 @@ from eval.tables.object_table import FILES as OBJECT_FILES
 from eval.tables.object_table import object_tables
 from eval.tables.regions.table import FILES as REGION_FILES
 from eval.tables.regions.table import region_tables
+from eval.tables.rows import without_costs_of_failures
 from eval.tables.surface.table import FILES as SURFACE_FILES
 from eval.tables.surface.table import surface_tables
 
@@ -209,6 +210,7 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     collected = collect_tables(run)
     results, items = collected["results"], {table: collected[table] for table in ITEM_TABLES}
     usable = {table: without_unusable(frame) for table, frame in collected.items()}
+    usable["results"] = without_costs_of_failures(usable["results"])
     tables = {
         "summary": summarise(usable["results"], keyframes=usable["keyframes"]),
         **{table: collected[table] for table in SURFACE_TABLES},

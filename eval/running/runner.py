@@ -37,6 +37,7 @@ from eval.running.scaling.shards import Shard, choose_cells, require_same_shard
 from eval.running.schedule import limit_pairs, schedule_pairs
 from eval.running.stages.pair_stages import PairStages
 from eval.truth.ground_truth import GroundTruth
+from scenarios.references import without_paths
 from sim.session.truth import read_pair_truth
 
 
@@ -86,6 +87,7 @@ def run_plan(
     """
     progress, tools = progress or Silent(), tools or TOOLS
     require_usable(where)
+    _require_either(force, limit)
     earlier_runs = _earlier_runs(run, mirror)
     for place, earlier in earlier_runs:
         _require_one_split(place, earlier, plan)
@@ -93,8 +95,7 @@ def run_plan(
     place, earlier = next(((place, told) for place, told in earlier_runs if told), ("", {}))
     all_cells = expand_cells(plan)
     own_cells = choose_cells(all_cells, shard)
-    told = {} if shard is None else {"shard": str(shard)}
-    provenance = {**_provenance(plan, all_cells, command, tools), **told}
+    provenance = {**_provenance(plan, all_cells, command, tools), **({} if shard is None else {"shard": str(shard)})}
     if mirror is not None:
         if earlier and not run.stored_provenance():  # an interrupt may leave cells of it
             write_json(run.path / "provenance.json", {**earlier, "finished": None})
@@ -138,6 +139,11 @@ def run_plan(
         mirror.copy_tables(run)
     n_died = int((results["status"] == "worker_died").sum())
     return RunOutcome(n_run, len(own_cells) - n_todo, n_todo - n_run, n_died)
+
+
+def _require_either(force: bool, limit: int | None) -> None:
+    if force and limit is not None:
+        raise InputError("--force removes every finished cell of the plan, and --limit runs a part: leave one out")
 
 
 def list_cells(
@@ -294,13 +300,16 @@ def _is_dropped(run: RunFolder, pair: Pair) -> bool | None:
 
 
 def _settle(run: RunFolder, pairs: Sequence[Pair], keep: Keep | None, progress: RunProgress, tools: Tools) -> None:
-    """Give the pairs that were finished before what `--keep` says: remove their sessions, or make them again."""
+    """Give the pairs that were finished before what `--keep` says: remove their sessions, or make those that lack."""
     for pair in pairs:
         if pair.todo or keep is None:
             continue
         if keep == "sessions":
             if dropped_file(run, pair.name, pair.seed).is_file():
                 remake_pair(run, pair.name, pair.seed, progress, tools)
+            elif not run.pair(pair.name, pair.seed).is_dir():  # removed by hand, or left behind by `merge-runs`
+                with pair_lock(run, pair):
+                    PairRun(run, pair, Made(None), progress, tools).open()
         elif keep == "nothing" or run.pair(pair.name, pair.seed).is_dir():
             with pair_lock(run, pair):
                 drop_pair(run, pair.name, pair.seed, keep)
@@ -324,8 +333,9 @@ def _compare_world(path: Path, pair: Pair) -> bool | None:
         truth = read_pair_truth(path)
     except InputError:
         return None
-    is_same = digest(truth.scenario) == digest(pair.scenario.model_dump(mode="json"))
-    return is_same and truth.seed == pair.seed and truth.files == pair.files
+    worlds = (truth.scenario, truth.files), (pair.scenario.model_dump(mode="json"), pair.files)
+    one, other = (digest(without_paths(drawn, files)) for drawn, files in worlds)
+    return one == other and truth.seed == pair.seed
 
 
 def _provenance(plan: Plan, all_cells: Sequence[Cell], command: Sequence[str], tools: Tools) -> Mapping[str, Any]:

@@ -6,6 +6,7 @@ scored again whenever the metrics change, and so can an answer that another prog
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from numbers import Real
@@ -41,6 +42,7 @@ from eval.truth.ground_truth import GroundTruth, load_ground_truth
 
 METRICS_VERSION = 7
 _NAN = float("nan")
+_OF_THE_RUN = ("commit", "is_contended")  # columns that a run adds to the row
 Metric = Callable[[GroundTruth, Answer], Mapping[str, float]]
 """`metric(truth, answer)`: columns by name; NaN where undefined. `answer.report` is None where a method gave none."""
 
@@ -146,7 +148,7 @@ def score_answer(answer: Answer, truth: GroundTruth) -> CaseScore:
         **_list_sizes(answer, truth, n_regions, float(after_travelled_m[-1])),
         **surface.columns,
     }
-    plugin_columns = compute_plugin_columns(truth, answer, row)
+    plugin_columns = compute_plugin_columns(truth, answer, {**row, **dict.fromkeys(_OF_THE_RUN)})
     row |= plugin_columns
     if answer.until == "merge":
         return CaseScore(row=row, changes=[], regions=[], objects=[], plugins=frozenset(plugin_columns))
@@ -183,9 +185,9 @@ def compute_plugin_columns(truth: GroundTruth, answer: Answer, taken: Mapping[st
         for column, value in metric(truth, answer).items():
             if column in taken or column in columns:
                 raise InputError(f"{METRICS}: {name!r}: column {column!r} exists already: give it another name")
-            if not isinstance(value, Real):
+            if not isinstance(value, Real) or math.isinf(value):
                 raise InputError(
-                    f"{METRICS}: {name!r}: column {column!r} = {value!r}: expected a number, NaN if undefined"
+                    f"{METRICS}: {name!r}: column {column!r} = {value!r}: expected a number, finite or NaN"
                 )
             columns[column] = float(value)
     return columns

@@ -18,7 +18,7 @@ from eval.report.surface.unrolled import draw_panels
 from eval.report.tables import Cell, Picture, Table
 from eval.scoring.surface.places import SurfacePlaces, carry_surface
 from eval.stories.comparisons import Comparison, Method, refused_sessions
-from eval.stories.places import RADIUS_M, ChosenPlace, choose_places, follow_places
+from eval.stories.places import RADIUS_M, ChosenPlace, choose_places, follow_places, is_measured
 from eval.stories.props import HIDDEN, MISSED, NO_ANSWER, OTHER_KIND, RIGHT, count_objects, follow_props
 from eval.tables.columns import UNDEFINED
 from sim.story import Story, is_story, read_story
@@ -73,6 +73,7 @@ def _content(
         "settings": ", ".join(method.settings),
         "has_truth": has_truth,
         "refused": refused_sessions(comparisons),
+        "is_measured": is_measured(comparisons),
         "charts": charts,
         "radius_m": RADIUS_M,
         "displacements": displacement_table(moved, has_truth=has_truth),
@@ -131,8 +132,8 @@ def _displacement_cell(row: pd.Series, *, has_truth: bool) -> Cell:
     true = f"true {_mm(row['true_m'])}" if has_truth else ""
     if not np.isfinite(row["displacement_m"]):
         return Cell(UNDEFINED, interval=true)
-    text = f"{_mm(row['displacement_m'])} \u00b1 {1000 * row['level_m']:.1f}"
-    return Cell(text, bool(row["is_beyond_level"]), true)
+    level = f"{1000 * row['level_m']:.1f}" if np.isfinite(row["level_m"]) else UNDEFINED
+    return Cell(f"{_mm(row['displacement_m'])} \u00b1 {level}", row["is_beyond_level"] is True, true)
 
 
 def _mm(value_m: float) -> str:

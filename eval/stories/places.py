@@ -13,6 +13,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.model.report import SurfaceField
 from cdpipe.surface import middle_place
+from eval.core.statistics import median
 from eval.scoring.surface.places import ANSWERED_M, SurfacePlaces, find_surface_places
 from eval.stories.comparisons import Comparison
 
@@ -111,14 +112,20 @@ def follow_places(comparisons: Sequence[Comparison], places: Sequence[ChosenPlac
     return table.reset_index(drop=True)
 
 
-def _measure(surface: SurfaceField | None, point: Float64Array) -> dict[str, float]:
-    found: dict[str, float] = dict.fromkeys(_MEASURED, _NAN) | {"n_points": 0, "is_beyond_level": False}
+def is_measured(comparisons: Sequence[Comparison]) -> bool:
+    """Tell whether the rock of any session was measured."""
+    return any(each.answer.report is not None and each.answer.report.surface is not None for each in comparisons)
+
+
+def _measure(surface: SurfaceField | None, point: Float64Array) -> dict[str, float | None]:
+    found: dict[str, float | None] = {**dict.fromkeys(_MEASURED, _NAN), "n_points": 0, "is_beyond_level": False}
     rows = _rows_near(surface, point)
     if surface is None or not len(rows):
         return found
-    moved_m, level_m = (float(np.median(each[rows])) for each in (surface.displacement_m, surface.level_m))
+    levels_m = surface.level_m[rows]
+    moved_m, level_m = median(surface.displacement_m[rows]), median(levels_m[np.isfinite(levels_m)])
     found |= {"n_points": len(rows), "displacement_m": moved_m, "level_m": level_m}
-    found["is_beyond_level"] = abs(moved_m) > level_m
+    found["is_beyond_level"] = None if np.isnan(level_m) else abs(moved_m) > level_m
     if surface.chainage_m is not None and surface.angle_deg is not None:
         chainage_m, angle_deg = middle_place(
             surface.points_map[rows], surface.chainage_m[rows], surface.angle_deg[rows]

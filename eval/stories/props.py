@@ -37,8 +37,9 @@ def count_objects(comparisons: Sequence[Comparison]) -> pd.DataFrame:
         report = each.answer.report
         row: dict[str, Any] = {"session": each.number}
         for kind in ("added", "removed", "moved", "reshaped"):
-            row[kind] = 0 if report is None else sum(item.kind == kind for item in report.objects)
-        row["moved"] //= 2  # both halves of a move
+            row[kind] = None if report is None else sum(item.kind == kind for item in report.objects)
+        if report is not None:
+            row["moved"] //= 2  # both halves of a move
         scored = None if each.score is None or report is None else each.score.objects
         row["false"] = None if scored is None else sum(item["outcome"] == "false" for item in scored)
         rows.append(row)

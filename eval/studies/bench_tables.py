@@ -89,6 +89,8 @@ def list_growth(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 def _exponent(row: Mapping[str, Any]) -> str:
     if row["exponent"] is None:
         return "-"
+    if row["low"] is None:  # of two sizes
+        return f"{row['exponent']:.2f}"
     return f"{row['exponent']:.2f} ({row['low']:.2f} to {row['high']:.2f})"
 
 

@@ -28,8 +28,9 @@ from eval.core.tablefile import table_file
 from eval.core.terminal.exits import run_program
 from eval.core.terminal.printing import echo
 from eval.plans.coverage import read_stored_plan
+from eval.report.render import write_file
 from eval.running.runfolder import read_json
-from eval.tables.rows import forced, records
+from eval.tables.rows import forced, records, with_pair
 
 ALARM_SHARE = 0.05
 FALSE_PER_100M = 0.1
@@ -91,6 +92,7 @@ def find_thresholds(results: pd.DataFrame, regions: pd.DataFrame, *, has_wide: b
     changed = results.loc[results["n_changes"] > 0, "scenario"].unique()
     if len(changed):
         raise InputError(f"{', '.join(changed)}: has changes: calibration needs unchanged pairs")
+    results = with_pair(results)  # a world that was not made alarms nobody
     rows = []
     kind = results["score_radius_m"].where(results["preset"].map(_tells_sites_apart) & has_wide)
     for (variant, _), cases in results.groupby(["variant", kind], sort=False, dropna=False):
@@ -171,9 +173,9 @@ def main(run: Annotated[Path, typer.Argument(help="folder of `tunnelcd run calib
     results, regions = (read_table(run / f"{name}.csv", "calibrate") for name in ("results", "regions"))
     plan = read_stored_plan(read_json(run / "provenance.json"))
     table = find_thresholds(results, regions, has_wide=plan is None or len(plan.wide) > 0)
-    table.to_csv(run / "thresholds.csv", index=False)
     settings = format_settings(table) + format_plan(table)
-    (run / "thresholds.yaml").write_text(settings, encoding="utf-8")
+    write_file(run / "thresholds.csv", table.to_csv(index=False))
+    write_file(run / "thresholds.yaml", settings)
     echo(*table.to_string(index=False).split("\n"), "", *settings.split("\n"))
 
 

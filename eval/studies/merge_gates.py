@@ -31,6 +31,7 @@ from eval.core.terminal.exits import run_program
 from eval.core.terminal.printing import echo
 from eval.plans.cells import expand_cells
 from eval.plans.coverage import read_stored_plan
+from eval.report.render import write_file
 from eval.running.runfolder import read_json
 from eval.studies.calibrate import read_table, require_validation
 from eval.tables.merge_table import RULES, is_accepted, is_right, kinds
@@ -219,8 +220,8 @@ def main(
         raise InputError(f"{path}: no merge was accepted: the plan's variant must set merge.accept_all=true")
     make_writable(out)
     table = tabulate_gates(cases, thresholds)
-    table.to_csv(out / "gates.csv", index=False)
-    (out / "gates.png").write_bytes(png(picture(draw_gates(cases, table))))
+    write_file(out / "gates.csv", table.to_csv(index=False))
+    write_file(out / "gates.png", png(picture(draw_gates(cases, table))))
     echo(*table.to_string(index=False, na_rep="-").split("\n"), "")
     n_other = len(results) - len(cases)
     echo(f"{len(cases)} merges; {n_other} further rows of results.csv were not merged or are of other variants")

@@ -101,6 +101,16 @@ def with_pair(results: pd.DataFrame) -> pd.DataFrame:
     return results[results["n_observable"].notna() | (results["status"] == "ok")]
 
 
+def without_costs_of_failures(results: pd.DataFrame) -> pd.DataFrame:
+    """Return rows of results.csv in which rows without an answer state neither times nor bytes.
+
+    A refused merge has its own time, and a failed answer may state any: none is what an answer costs.
+    """
+    costs = [name for name in results.columns if str(name).startswith(("t_", "bytes_"))]
+    is_of_answer = is_answered(results)
+    return results.assign(**{name: results[name].where(is_of_answer) for name in costs})
+
+
 def wilson_over_tunnels(is_hit: BoolArray, results: pd.DataFrame) -> tuple[float, float]:
     """Return the 95 % Wilson interval of the share of (N,) pairs that are hits, as of so many as there are tunnels."""
     share = len(np.unique(tunnels_of(results))) / max(len(results), 1)

@@ -12,11 +12,11 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from eval.core.statistics import mean_with_interval, median
+from eval.core.statistics import interval_over_tunnels, mean_with_interval, median
 from eval.plans.targets import PROPOSED, RATE_COLUMN, Target, Targets
 from eval.tables.conditions import ANY, by_condition, odometry_of, of_condition
 from eval.tables.regions.curves import RankedPairs, recall_difference
-from eval.tables.rows import numbers, records, texts
+from eval.tables.rows import numbers, records, texts, tunnels_of
 
 COLUMNS = ("target", "domain", "variant", "value", "low", "high", "asked", "n", "is_met")
 # what a column is over, where that is not every pair of its row
@@ -131,7 +131,8 @@ def _on_site(target: Target, variant: str, results: pd.DataFrame) -> dict[str, A
         values = numbers(own, "bytes_map_before") / numbers(own, "bytes_regions_before")
     else:
         values = numbers(own, target.column)
-    value, low, high, n = mean_with_interval(values)
+    value, _, _, n = mean_with_interval(values)
+    low, high = interval_over_tunnels(values, tunnels_of(own))
     if target.column.startswith("t_"):
         value, low, high = median(values), math.nan, math.nan
     return {"domain": target.site, "value": value, "low": low, "high": high, "n": n}

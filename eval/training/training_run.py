@@ -69,6 +69,9 @@ def train_descriptor(
     """
     if (out / "dataset.json").exists():
         raise InputError(f"{out}: holds training data, and weights among them would be taken for it: name a new folder")
+    own = {"state.safetensors", "curves.csv", "curves.png", f"{name}.json", f"{name}.safetensors"}
+    if others := sorted({path.name for path in out.glob("[!.]*")} - own):
+        raise InputError(f"{out}: holds {others[0]}, which is of no training of {name}: name a new folder")
     use_threads(threads)
     place = find_device(device)
     tunnels = open_dataset(data, "train"), open_dataset(data, "validation")

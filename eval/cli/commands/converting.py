@@ -75,6 +75,10 @@ def convert(
 
     if len(sources) not in (1, _ANSWER):
         raise InputError(f"{len(sources)} inputs: expected one, or BEFORE AFTER ANSWER, and then the output")
+    if out.is_file():  # before hours of reading
+        raise InputError(f"{out} exists already: name a new file or remove it")
+    if out.is_dir() and any(out.iterdir()):
+        raise InputError(f"{out}: is not empty: name a new or empty folder for the output")
     asked = join_world_settings(world, settings)
     hows = how_to_read(min(len(sources), 2), form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin)
     with shown_warnings(), shown_progress(quiet) as progress:
@@ -163,9 +167,10 @@ def _convert_answer(
     sources: Sequence[Path], out: Path, to: str | None, hows: Sequence[HowToRead], cell_m: float, progress: RunProgress
 ) -> str:
     from eval.converting.formats import choose_format
-    from eval.converting.writing import write_answer_map
+    from eval.converting.writing import require_map, write_answer_map
 
     name = choose_format(out, to)
+    require_map(out, name)  # before hours of reading
     before, after = open_sources(*open_inputs(sources[:2], hows, progress))
     return write_answer_map((before, after), sources[2], out, name, cell_m, progress)
 
@@ -221,12 +226,12 @@ def _export(
     from cdpipe.io.readers import open_session
     from cdpipe.io.session import read_session
     from eval.converting.formats import FORMATS, choose_format
-    from eval.converting.request import Request
+    from eval.converting.request import ONLY_OURS, Request
     from eval.converting.writing import write_session
 
     name = choose_format(out, to)
     if how is not None and FORMATS[name].is_ours_alone:
-        raise InputError(f"{out}: a recording becomes a session: name a new folder, and convert that session")
+        raise InputError(f"{source}: {ONLY_OURS}")
     opened = open_session(source, how, progress.stage)
     session = read_session(source) if how is None else None
     request = Request(opened, session, progress, with_truth, cell_m)

@@ -152,10 +152,11 @@ def leaderboard(
     quiet: Quiet = False,
 ) -> None:
     """Check packed results and make one offline page of them, beside the reference rows."""
-    from eval.leaderboard.page import write_leaderboard
+    from eval.leaderboard.page import require_page, write_leaderboard
     from eval.leaderboard.submission import read_submission, score_again
     from eval.running.runfolder import open_run_folder
 
+    require_page(out)
     run = None if pairs is None else open_run_folder(pairs)
     found, checked = [], []
     with shown_progress(quiet) as progress:

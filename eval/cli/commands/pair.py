@@ -22,6 +22,7 @@ from eval.cli.inputs import (
     how_to_read,
     open_inputs,
     open_sources,
+    with_surface,
 )
 from eval.cli.options import KindOfSite, OutFolder, Preset, Quiet, SetSettings, require_method_settings
 from eval.cli.printed_answer import print_answer
@@ -98,10 +99,12 @@ def detect(
     from eval.core.output import new_folder
 
     require_method_settings(settings)
-    settings = _with_surface(preset, settings or [], site) if surface else settings or []
+    settings = with_surface(preset, settings or [], site) if surface else settings or []
     config = cdpipe.load_config(preset, settings, site)
-    known = _read_known_merge(before_T_after, assume_aligned=assume_aligned)
     hows = how_to_read(2, form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin)
+    origins_m = [how.subtracted_m(path) for how, path in zip(hows, (before, after), strict=True)]
+    known = _read_known_merge(before_T_after, origins_m, assume_aligned=assume_aligned)
+    cdpipe.require_usable(config)  # before hours of reading
     try:
         with shown_warnings(), new_folder(out) as partial, shown_progress(quiet) as progress:
             earlier, later = open_inputs([before, after], hows, progress)
@@ -125,14 +128,6 @@ def detect(
     files = ["answer.json", "answer.npz", "regions.csv", "objects.csv", "objects.ply"]
     files += [] if report.surface is None else ["surface.csv", "surface.ply", "surface.png"]
     print_answer(report, out, [*files, *(["answer.html"] if html else [])], config.query.threshold)
-
-
-def _with_surface(preset: str, settings: Sequence[str], site: KindOfSite) -> list[str]:
-    """Return settings that measure displacement: by `planes`, unless the preset or a setting names a method."""
-    import cdpipe
-
-    is_named = cdpipe.load_config(preset, settings, site).surface.method != "none"
-    return [*settings] if is_named else ["surface.method=planes", *settings]
 
 
 def _write_page(
@@ -164,7 +159,9 @@ def _draw_surface(surface: SurfaceField, path: Path) -> None:
     path.write_bytes(png(figure))
 
 
-def _read_known_merge(path: Path | None, *, assume_aligned: bool) -> Float64Array | None:
+def _read_known_merge(
+    path: Path | None, origins_m: Sequence[tuple[float, float, float]], *, assume_aligned: bool
+) -> Float64Array | None:
     import numpy as np
 
     from cdpipe.core.errors import InputError
@@ -174,7 +171,7 @@ def _read_known_merge(path: Path | None, *, assume_aligned: bool) -> Float64Arra
         return np.eye(4) if assume_aligned else None
     if assume_aligned:
         raise InputError(f"--before-T-after {path}: --assume-aligned says another merge: give one of them")
-    return read_known_merge(path)
+    return read_known_merge(path, origins_m)
 
 
 def _evidence_table(evidence: Mapping[str, float], config: PipelineConfig) -> pd.DataFrame:

@@ -94,6 +94,7 @@ def run_command(
     quiet: Quiet = False,
 ) -> None:
     """Run a plan: scenarios x seeds x variants. Finished cells are kept."""
+    from cdpipe.core.errors import InputError
     from eval.core.cluster import Where, exposure, require_reachable, require_usable
     from eval.plans.changes import change_plan
     from eval.plans.plan import load_plan
@@ -105,6 +106,8 @@ def run_command(
     )
     where, part = Where(workers, scheduler), None if shard is None else parse_shard(shard)
     require_usable(where)
+    if dry_run and rows_to is not None:
+        raise InputError("--dry-run looks into the run folder alone: leave --rows-to out")
     if dry_run:
         _list_cells(chosen, out, force=force, limit=limit, shard=part)
         return
@@ -127,9 +130,12 @@ def merge_runs_command(
     from contextlib import ExitStack
     from tempfile import TemporaryDirectory
 
+    from cdpipe.core.errors import InputError
     from eval.running.scaling.merging import merge_runs
     from eval.running.scaling.mirror import Mirror, is_url
 
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: is a file or not empty: name a new or empty folder for the output")
     with ExitStack() as stack, shown_progress(quiet, rate="cells") as progress:
         places = []
         for folder in folders:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from eval.cli.inputs import read_metres
+from eval.cli.inputs import read_metres, with_surface
 from eval.cli.options import KindOfSite, OutFolder, Preset, Quiet, SetSettings
 from eval.core.terminal.printing import LINE, echo, print_table, say, shown_warnings
 from eval.core.terminal.progress import shown_progress
@@ -54,14 +54,16 @@ def story_command(
 
     from eval.stories import write_story_page
     from eval.stories.comparisons import Method, run_comparisons
+    from eval.stories.places import is_measured
 
     given = [np.array(read_metres("at", text)) for text in at or ()]
-    method = Method(preset, site, ("surface.method=planes", *(settings or ())))
+    method = Method(preset, site, tuple(with_surface(preset, settings or (), site)))
     with shown_warnings(), shown_progress(quiet, rate="sessions") as progress:
         comparisons = run_comparisons(story, out, method, progress, with_truth=with_truth)
     moved = write_story_page(story, out, method, comparisons, given)
     if moved.empty:
-        say(quiet, "no region of rock moved in any session")
+        measured = is_measured(comparisons)
+        say(quiet, "no region of rock moved in any session" if measured else "rock was not measured in any session")
     elif not quiet:
         print_table("displacement since session 1, mm, and 95 % level of detection", moved, LINE)
     echo(f"page: {out / 'index.html'}")

@@ -24,7 +24,11 @@ from eval.core.terminal.printing import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import pandas as pd
+
+    from scenarios.schema import Scenario
 
 _SPEED_GIVES_WAY = (("n", "spread"), ("rival_value",), ("rival",))
 _GROWTH_GIVES_WAY = (("peak_mb", "wall_s"), ("smallest", "first"), ("largest", "last"))
@@ -255,7 +259,7 @@ def check_file(name_or_path: str) -> str:
     from eval.plans.files import plan_names
     from eval.plans.plan import Plan, load_plan
     from scenarios import check_scenario, scenario_names
-    from scenarios.library import CHECKED_SEEDS, load_grafted
+    from scenarios.library import CHECKED_SEEDS, load_grafted, load_scenario
     from scenarios.schema import Scenario
 
     names = {"plan": plan_names(), "scenario": scenario_names(), "preset": preset_names()}
@@ -276,32 +280,31 @@ def check_file(name_or_path: str) -> str:
         content = read_yaml(Path(name_or_path)).value
         own = set(content) if isinstance(content, dict) else set()
         if own & {"props", "surface"} and not own & {"tunnel", "extends", "recording"}:
-            for seed in CHECKED_SEEDS:  # any file may stand for the recording
-                load_grafted(name_or_path, {"sessions": [name_or_path]}, seed)
+            # any file may stand for the recording
+            drawn = [load_grafted(name_or_path, {"sessions": [name_or_path]}, seed) for seed in CHECKED_SEEDS]
+            _open_meshes(name_or_path, drawn)
             return "a file of props and rock for `graft --objects`"
         kind = max(keys, key=lambda name: len(own & keys[name]))
     if kind == "plan":
         return f"a plan of {len(expand_cells(load_plan(name_or_path)))} cells"
     if kind == "scenario":
         check_scenario(name_or_path)
-        _open_meshes(name_or_path)
+        _open_meshes(name_or_path, [load_scenario(name_or_path, seed) for seed in CHECKED_SEEDS])
     else:
         load_config(name_or_path)
     return f"a {kind}"
 
 
-def _open_meshes(scenario: str) -> None:
-    """Read every mesh that a scenario names for one of the checked seeds, as `simulate` reads it.
+def _open_meshes(scenario: str, drawn: Sequence[Scenario]) -> None:
+    """Read every mesh that a scenario names as drawn for one of the checked seeds, as `simulate` reads it.
 
     Raises:
         ScenarioError: Some cannot be used: one line each.
     """
     from cdpipe.core.errors import ScenarioError
     from scenarios.grafted import GraftScenario
-    from scenarios.library import CHECKED_SEEDS, load_scenario
     from sim.rock.foreign import prop_mesh, tunnel_mesh
 
-    drawn = [load_scenario(scenario, seed) for seed in CHECKED_SEEDS]
     simulated = [each for each in drawn if not isinstance(each, GraftScenario)]  # the walls of the others are recorded
     tunnels = dict.fromkeys(each.tunnel.mesh for each in simulated if each.tunnel.mesh)
     props = dict.fromkeys((prop.mesh, prop.name) for each in drawn for prop in each.props if prop.mesh)

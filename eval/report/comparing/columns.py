@@ -11,7 +11,7 @@ from cdpipe.core.geometry import Float64Array
 from eval.report.pooled import POOLED
 from eval.tables.columns import RESULT_COLUMNS, Column, select, share, significant
 from eval.tables.merge_table import RULES, is_within_target, kinds
-from eval.tables.rows import numbers, with_domain
+from eval.tables.rows import numbers, with_domain, without_costs_of_failures
 from eval.tables.targets import is_unchanged_pair
 
 # kinds of pair at which a refusal can be right
@@ -62,10 +62,9 @@ def figures_of(results: pd.DataFrame) -> pd.DataFrame:
         "is_answered": answered,
         "is_within_target": within,
     }
+    results = without_costs_of_failures(results)
     stored = [column.key for column in COMPARED if column.key not in (*columns, POOLED) and column.key in results]
     figures = {**columns, **{key: _as_numbers(results, key) for key in stored}}
-    # what a failed answer states of its time is no time of an answer
-    figures |= {key: np.where(results["status"] == "ok", figures[key], np.nan) for key in stored if is_time(key)}
     if (
         "is_alarm" in stored and "is_unchanged_pair" in results
     ):  # who refuses the pairs on which he would cry wolf is not silent

@@ -22,7 +22,7 @@ from eval.running.results.run_data import RunData
 from eval.running.results.sides import Side, check_extras, check_versions, matched_variants
 from eval.tables.columns import Column
 from eval.tables.regions.curves import recall_at, recall_difference
-from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, numbers, tunnels_of
+from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, numbers, tunnels_of, with_pair
 
 BETTER, WORSE, NOISE = "better", "worse", "no difference beyond noise"
 SAME, TOO_FEW, NOT_JUDGED = "the same", "too few pairs", "not judged"
@@ -55,7 +55,7 @@ def compare(a: Side, b: Side, *, times_count: bool = True, seed: int = 0) -> pd.
     check_versions(a, b)
     check_extras(a)
     check_extras(b)
-    figures = [figures_of(side.results) for side in (a, b)]
+    figures = [figures_of(with_pair(side.results)) for side in (a, b)]
     rows: list[dict[str, Any]] = []
     for variants in matched_variants(a, b):
         own = [frame[frame["variant"] == name] for frame, name in zip(figures, variants, strict=True)]

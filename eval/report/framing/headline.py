@@ -54,8 +54,8 @@ def write_answer(data: RunData, merges: pd.DataFrame) -> str:
     """
     if ends_at_merge(data):
         return _of_merges(data, merges)
-    told = _of_axes(data) or _of_surfaces(data) or _of_pairs(data) or _of_silence(data)
-    return told or _TOO_LITTLE
+    told = _of_axes(data) or _of_surfaces(data) or _of_pairs(data, "high") or _of_silence(data)
+    return told or _of_pairs(data, "low") or _TOO_LITTLE  # nothing changed in any pair
 
 
 def name_leaders(
@@ -154,10 +154,14 @@ def _told(table: pd.DataFrame, column: Column, judge: Callable[[str, str, str], 
     return f"{extreme} {column.heading}{by}, {'; '.join(parts)}." if parts else ""
 
 
-def _of_pairs(data: RunData) -> str:
+def _of_pairs(data: RunData, better: str) -> str:
     ranked, shown, figures = rank_methods(data)
-    column = next((column for column in HEADLINES if column in shown and column.better == "high"), None)
-    return "" if column is None else _told(ranked, column, partial(_judge_in_domain, data, figures, column))
+    column = next((column for column in HEADLINES if column in shown and column.better == better), None)
+    if column is None:
+        return ""
+    # a mean over fewer pairs, of those that suit a method, leads nothing
+    is_whole = ranked["n_pairs"] == ranked.groupby("domain")["n_pairs"].transform("max")
+    return _told(ranked[is_whole], column, partial(_judge_in_domain, data, figures, column))
 
 
 def _judge_in_domain(data: RunData, figures: pd.DataFrame, column: Column, domain: str, first: str, second: str) -> str:
@@ -183,9 +187,13 @@ def _of_axes(data: RunData) -> str:
     held = count_held(points)
     if not held:
         return ""
-    leaders = name_leaders(((name, float(n)) for name, n in held.items()), _HELD)
+    # methods that were measured on other axes are not compared
+    measured = points[points["is_measured"]].groupby("variant")["axis"].agg(frozenset)
+    is_fair = measured.nunique() == 1 and len(measured) == points["variant"].nunique()
+    leaders = name_leaders(((name, float(n)) for name, n in held.items()), _HELD) if is_fair else ""
     main = shown_variant(data)
-    return f"Holds on most axes: {leaders}; {name_breaks(points, main if main in held else next(iter(held)))}."
+    told = name_breaks(points, main if main in held else next(iter(held)))
+    return f"Holds on most axes: {leaders}; {told}." if leaders else f"{told}."
 
 
 def _of_surfaces(data: RunData) -> str:

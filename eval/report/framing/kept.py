@@ -35,12 +35,11 @@ _TABLED = ("regions", "objects", "surface", "merge")
 
 @dataclass(slots=True)
 class KeptPage:
-    """What a page shows: tables by caption, pictures with the heading above them by section, and what it lacked."""
+    """What a page shows: tables by caption, and pictures with the heading above them by section."""
 
     tables: dict[tuple[str, str], Table] = field(default_factory=dict)
     pictures: dict[str, list[tuple[str, Picture]]] = field(default_factory=dict)
     titles: dict[str, str] = field(default_factory=dict)
-    missing: list[str] = field(default_factory=list)
 
     def of_site(self, title: str) -> list[tuple[str, Picture]]:
         """Return the pictures of the section with a title."""
@@ -88,7 +87,7 @@ def keep(content: Mapping[str, Any], kept: KeptPage) -> dict[str, Any]:
         for key, pictures in kept.pictures.items() if key not in taken
     }  # fmt: skip
     if kept.tables:
-        found["missing"] = list(dict.fromkeys([*kept.missing, _KEPT]))
+        found["missing"] = [*found["missing"], _KEPT]
     return found
 
 
@@ -166,7 +165,7 @@ class _Reader(HTMLParser):
         classes = named.get("class", "").split()
         if "id" in named and (tag == "h2" or (tag == "details" and "section" in classes) or named["id"] == "summary"):
             self._section, self._heading = named["id"], ""
-        if tag in ("h2", "h3", "caption", "figcaption", "li") or (tag == "p" and "title" in classes):
+        if tag in ("h2", "h3", "caption", "figcaption") or (tag == "p" and "title" in classes):
             self._part = "title" if tag == "p" else tag
             self._texts[self._part] = []
         elif tag == "table":
@@ -198,8 +197,6 @@ class _Reader(HTMLParser):
             self.found.titles[self._section] = self._text("h2").strip()
         elif tag == "h3":
             self._heading = self._text("h3").strip()
-        elif tag == "li" and self._section == "missing":
-            self.found.missing.append(self._text("li").strip())
         if tag not in ("small", "span", "a", "code"):
             self._part = ""
 

@@ -15,7 +15,7 @@ from eval.running.results.cases import find_repeats
 from eval.running.results.run_data import RunData, covered_by, ends_at_merge, shown_variant
 from eval.running.results.values import text
 from eval.tables.merge_table import EXACT_M, RIGHT_DEG, RIGHT_M, RULES, TIMES, is_within_target, kinds, merge_table
-from eval.tables.rows import numbers
+from eval.tables.rows import numbers, with_pair
 
 N_WORST = 10
 MAX_PICTURES = 24
@@ -73,7 +73,8 @@ def _plots(results: pd.DataFrame) -> list[Chart]:
 
 def _chosen_cases(data: RunData, results: pd.DataFrame, name: str, notes: list[str]) -> tuple[list[Table], list[Case]]:
     """Return the worst accepted merges of the variant that is shown, and all of its pairs outside their target."""
-    mine = np.flatnonzero((results["variant"] == name).to_numpy())
+    has_pair = results.index.isin(with_pair(results).index)
+    mine = np.flatnonzero((results["variant"] == name).to_numpy() & has_pair)
     badness = np.fmax(numbers(results, "merge_error_m") / RIGHT_M, numbers(results, "merge_error_deg") / RIGHT_DEG)
     # an error that is undefined is the worst: the sessions share no place
     badness = np.nan_to_num(badness, nan=np.inf)

@@ -49,7 +49,7 @@ def draw_objects(data: RunData) -> Section | None:
         targets_table(stored_table(data, "objects_targets")),
         *(groups_table(groups, domain, main, voxel_variants(data, main)) for domain in domains),
     ]
-    plots = (_size_plot(groups, data, main),) if len(groups) else ()
+    plots = (_size_plot(groups, data, main),) if len(groups) and data.changes else ()
     return Section(with_rows(tables), plots, pictures=tuple(pictures), missing=tuple(missing))
 
 

@@ -79,7 +79,9 @@ def budget_areas(budgets: pd.DataFrame) -> Table:
         of_variant = {str(name): part for name, part in firsts.groupby("variant", sort=False)}
         areas = {name: dict(zip(part["price"], records(part), strict=True)) for name, part in of_variant.items()}
         names = sorted(areas, key=lambda name: (is_told_the_truth(name), -np.nan_to_num(areas[name]["bytes"]["area"])))
-        marks = {price: best_rows([areas[name][price] for name in names], _AREA, [1] * len(names)) for price in _PRICES}
+        its = {price: [areas[name][price] for name in names] for price in _PRICES}
+        counts = {price: [int(row["n_changes"]) for row in rows_of] for price, rows_of in its.items()}
+        marks = {price: best_rows(its[price], _AREA, counts[price]) for price in _PRICES}
         for place, name in enumerate(names):
             cells = [_area_cell(areas[name][price], is_best=marks[price][place]) for price in _PRICES]
             rows.append((domain_name(domain), (Cell(spaced(name)), *cells)))

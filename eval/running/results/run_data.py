@@ -19,6 +19,7 @@ from eval.running.results.values import Row
 from eval.running.runfolder import RunFolder, read_json
 from eval.tables.conditions import COLUMNS as CONDITION_COLUMNS
 from eval.tables.conditions import Condition, by_condition, of_condition
+from eval.tables.rows import records, without_costs_of_failures
 
 # columns of text of the derived tables
 _DERIVED_TEXTS = {"domain", "variant", *CONDITION_COLUMNS}
@@ -99,6 +100,7 @@ def read_run(run: Path) -> RunData:
     if absent:
         raise InputError(f"{path}: column {', '.join(absent)} is missing: expected a table written by `tunnelcd run`")
     require_cases(path, pd.DataFrame(results))
+    results = tuple(records(without_costs_of_failures(pd.DataFrame(results))))
     missing = []
     items: dict[str, tuple[Row, ...]] = {"changes": (), "regions": ()}
     for name in items:

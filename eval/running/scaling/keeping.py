@@ -20,6 +20,7 @@ from eval.core.provenance import digest
 from eval.running.cell_file import NO_KEY
 from eval.running.runfolder import NEW_TABLES, RunFolder, write_json
 from eval.running.stages.stage_cache import files_digest
+from scenarios.references import without_paths
 from sim.session.truth import read_pair_truth
 
 Keep = Literal["answers", "sessions", "nothing"]
@@ -135,7 +136,9 @@ def is_dropped(
 ) -> bool | None:
     """Tell whether the removed sessions of a pair were made from this scenario and these files; None without them."""
     record = None if run.pair(world, seed).exists() else read_dropped(dropped_file(run, world, seed))
-    return None if record is None else digest(record.scenario) == digest(scenario) and record.files == files
+    if record is None:
+        return None
+    return digest(without_paths(record.scenario, record.files)) == digest(without_paths(scenario, files))
 
 
 def _remove_answers(run: RunFolder, world: str, seed: int) -> None:

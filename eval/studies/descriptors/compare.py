@@ -24,14 +24,15 @@ from cdpipe.model.config import load_config
 from eval.core.domains import domain_of
 from eval.core.output import make_writable, remove
 from eval.core.provenance import digest, git_commit, machine
-from eval.core.statistics import bootstrap_interval, mean_with_interval, median
+from eval.core.statistics import bootstrap_interval, interval_over_tunnels, mean, median
 from eval.core.terminal.exits import run_program
 from eval.core.terminal.progress import RunProgress, shown_progress
 from eval.plans.seeds import parse_seeds_option
 from eval.plans.worlds import world_slug
+from eval.report.render import write_file
 from eval.running.runfolder import read_json, write_json
 from eval.studies.descriptors.rows import METHODS, SPHERE, measure_pair
-from eval.tables.rows import numbers
+from eval.tables.rows import numbers, tunnels_of
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
@@ -204,7 +205,9 @@ def _groups(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 
 
 def _mean(cases: pd.DataFrame, column: str) -> dict[str, float]:
-    value, low, high, _ = mean_with_interval(numbers(cases, column))
+    values = numbers(cases, column)
+    low, high = interval_over_tunnels(values, tunnels_of(cases.assign(scenario=cases["family"])))
+    value = mean(values)
     return {column: value, f"{column}_low": low, f"{column}_high": high}
 
 
@@ -232,10 +235,9 @@ def main(
         rows = measure(families or _FAMILIES, parse_seeds_option(seeds), out, progress, settings or (), keep=keep)
     tables = {"descriptors": rows, "places": tabulate_places(rows), "spheres": tabulate_spheres(rows)}
     for name, table in tables.items():
-        table.to_csv(out / f"{name}.csv", index=False)
-    (out / "command.txt").write_text(
-        shlex.join(["python", "-m", "eval.studies.descriptors.compare", *sys.argv[1:]]) + "\n"
-    )
+        write_file(out / f"{name}.csv", table.to_csv(index=False))
+    command = shlex.join(["python", "-m", "eval.studies.descriptors.compare", *sys.argv[1:]])
+    write_file(out / "command.txt", f"{command}\n")
     for name in ("places", "spheres"):
         typer.echo(tables[name].to_string(index=False, float_format="{:.4g}".format, na_rep="-") + "\n")
 

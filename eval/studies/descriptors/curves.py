@@ -26,7 +26,6 @@ from torch import Tensor
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, stream
 from cdpipe.core.ranking import auroc
-from cdpipe.core.whole_file import whole_file
 from cdpipe.descriptors import use_threads
 from cdpipe.descriptors.sphere_network import (
     SphereNetwork,
@@ -43,6 +42,7 @@ from eval.core.output import make_writable
 from eval.core.statistics import mean
 from eval.core.tablefile import read_table
 from eval.core.terminal.exits import run_program
+from eval.report.render import write_file
 from eval.studies.descriptors.curve_plots import curves_chart
 from eval.tables.rows import records
 from eval.training.training_run import data_digest
@@ -279,9 +279,8 @@ def main(
         found = make_rows(network, held, {"point": name, **run, **of_point, "cpu_s": cpu_s})
         rows += found
         table = pd.DataFrame(rows)
-        with whole_file(path) as partial:
-            table.to_csv(partial, index=False, float_format="%.5g")
-        path.with_suffix(".png").write_bytes(png(picture(curves_chart(table))))
+        write_file(path, table.to_csv(index=False, float_format="%.5g"))
+        write_file(path.with_suffix(".png"), png(picture(curves_chart(table))))
         typer.echo(f"{name}: log-likelihood {found[0]['log_likelihood']:.4f}, AUROC {found[0]['auroc']:.4f}")
 
 

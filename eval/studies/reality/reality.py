@@ -21,6 +21,7 @@ import typer
 
 from eval.core.output import make_writable
 from eval.core.terminal.exits import run_program
+from eval.report.render import write_file
 from eval.studies.reality.plots import draw_measures, draw_novelty, draw_scene
 from eval.studies.reality.scenes import (
     cast_at_origin,
@@ -111,9 +112,9 @@ def main(
     ]
     novelty = tabulate_novelty(shares)
     text = "\n".join(format_markdown(table) for table in (arrange_by_source(measures), novelty))
-    measures.to_csv(out / "reality.csv", index=False, float_format="%.5g")
-    novelty.to_csv(out / "reality-novelty.csv", index=False, float_format="%.4g")
-    (out / "reality.md").write_text(text, encoding="utf-8")
+    write_file(out / "reality.csv", measures.to_csv(index=False, float_format="%.5g"))
+    write_file(out / "reality-novelty.csv", novelty.to_csv(index=False, float_format="%.4g"))
+    write_file(out / "reality.md", text)
     draw_measures(measures, out / "reality-measures.png")
     draw_scene(real, recast, out / "reality-scene.png")
     draw_novelty(shares, out / "reality-novelty.png")

@@ -59,7 +59,7 @@ class RankedPairs:
         n_found_so_far: (R,) int64 observable changes that they and it find.
         change_pair: (C,) int64 pair of each change.
         change_score: (C,) score of the best candidate that finds it, -inf for none.
-        change_rank: (C,) int64 place of that candidate in its pair from 0, R for none.
+        change_rank: (C,) int64 place from 0 of the best candidate of its pair, each by its own score, R for none.
         change_rows: (C,) int64 its row in the table of changes.
     """
 
@@ -117,22 +117,22 @@ def ranked_pairs(
     }
     of_pair = np.array([place[str(a), int(b)] for a, b in regions[PAIR].itertuples(index=False, name=None)], np.int64)
     scores = regions["score"].to_numpy(dtype=np.float64)
+    rank = _rank(scores, of_pair)
     if not is_proposal:
         scores = np.where(forced(regions), _ABOVE_ALL, scores)
     n_new, is_false = np.zeros(len(scores), np.int64), np.zeros(len(scores), np.bool_)
     change_score = np.full(len(rows), -np.inf)
     change_rank = np.full(len(rows), len(scores), np.int64)
-    ranks = np.zeros(len(pairs), np.int64)
     is_told = is_proposal and "found_changes_proposed" in regions  # tables of older runs lack the column
     found_changes = regions["found_changes_proposed" if is_told else "found_changes"].tolist()
     order = np.lexsort((np.arange(len(scores)), -scores, of_pair))
     for candidate in order.tolist():
         pair, found = int(of_pair[candidate]), parsed_ids(found_changes[candidate])
         is_false[candidate] = not found
-        new = [i for change in found if (i := number.get((pair, change))) is not None and change_score[i] == -np.inf]
-        change_score[new], change_rank[new] = scores[candidate], ranks[pair]
-        n_new[candidate] = len(new)
-        ranks[pair] += 1
+        its = [i for change in found if (i := number.get((pair, change))) is not None]
+        change_rank[its] = np.minimum(change_rank[its], rank[candidate])
+        new = [i for i in its if change_score[i] == -np.inf]
+        change_score[new], n_new[candidate] = scores[candidate], len(new)
     return RankedPairs(
         pairs=tuple(pairs),
         tunnels=tunnel_numbers(*zip(*pairs, strict=True)) if pairs else np.zeros(0, np.int64),
@@ -151,6 +151,12 @@ def ranked_pairs(
         change_rank=change_rank,
         change_rows=rows,
     )
+
+
+def _rank(scores: Float64Array, pair: Int64Array) -> Int64Array:
+    """Return (R,) the place from 0 of each candidate of a pair by its own score, of equal ones in their order."""
+    order = np.lexsort((np.arange(len(scores)), -scores, pair))
+    return _so_far(np.ones(len(scores), np.int64), pair, order) - np.int64(1)
 
 
 def _so_far(counts: Int64Array, pair: Int64Array, order: Int64Array) -> Int64Array:

@@ -19,7 +19,7 @@ from cdpipe.io.readers import open_session
 from cdpipe.model.config import DescriptorConfig
 from cdpipe.model.types import DescriptorSet, ScanSource
 from cdpipe.pipeline import mapping
-from eval.cli.commands.pair import _with_surface
+from eval.cli.inputs import with_surface
 from eval.cli.main import main
 from eval.graft import making
 from eval.plans import cells as plan_cells
@@ -567,6 +567,8 @@ def test_programs_tell_mistakes_as_the_commands_do(
 def test_surface_keeps_the_method_that_a_preset_or_a_setting_names(tmp_path: Path) -> None:
     mine = tmp_path / "mine.yaml"
     mine.write_text("surface: {method: c2c}\n")
-    assert _with_surface(str(mine), [], "narrow") == []
-    assert _with_surface("tunnelcd", ["surface.method=c2m"], "narrow") == ["surface.method=c2m"]
-    assert _with_surface("tunnelcd", [], "narrow") == ["surface.method=planes"]
+    assert with_surface(str(mine), [], "narrow") == []
+    assert with_surface("tunnelcd", ["surface.method=c2m"], "narrow") == ["surface.method=c2m"]
+    assert with_surface("tunnelcd", [], "narrow") == ["surface.method=planes"]
+    with pytest.raises(InputError, match=r"surface\.method=none: displacement is to be measured"):
+        with_surface("tunnelcd", ["surface.method=none"], "narrow")

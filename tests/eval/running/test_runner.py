@@ -39,7 +39,7 @@ from eval.running.runfolder import (
     write_json,
     write_tables,
 )
-from eval.running.runner import RunOutcome, _provenance
+from eval.running.runner import RunOutcome, _provenance, run_plan
 from eval.running.stages.pair_stages import time_parts
 from eval.scoring.scoring import METRICS_VERSION
 from eval.truth.adapters import pipeline_input
@@ -205,6 +205,22 @@ def test_an_infinite_figure_of_a_cell_stands_in_results_alone(smoke_copy: RunFol
     path.write_text(json.dumps(cell))
     assert np.isinf(write_tables(smoke_copy)["n_partial"]).sum() == 1
     assert not np.isinf(pd.read_csv(smoke_copy.path / "summary.csv").select_dtypes("number")).any(axis=None)
+
+
+def test_force_and_a_limit_would_leave_others_without_rows(smoke_copy: RunFolder, tmp_path: Path) -> None:
+    before = sorted(path.name for path in smoke_copy.path.glob("cells/*/*/*"))
+    with pytest.raises(InputError, match="--force removes every finished cell of the plan, and --limit runs a part"):
+        run_plan(load_plan("smoke"), smoke_copy, force=True, limit=1)
+    assert sorted(path.name for path in smoke_copy.path.glob("cells/*/*/*")) == before
+
+
+def test_sessions_that_were_removed_by_hand_are_made_again_on_demand(tmp_path: Path, runner: Runner) -> None:
+    plan = plan_of(tmp_path)
+    run, _ = runner.run(tmp_path / "run", plan)
+    shutil.rmtree(run.path / "pairs")
+    assert runner.run(run.path, plan)[1].n_done == 0 and not (run.path / "pairs").exists()
+    assert runner.run(run.path, plan, keep="sessions")[1].n_done == 0
+    assert (run.pair(ONE_BOX, 20000) / "truth" / "changes.json").is_file()
 
 
 def test_tables_that_cannot_all_be_written_stay_those_of_before(

@@ -4,6 +4,8 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from cdpipe.core.errors import ScenarioError
 from cdpipe.sensor.ouster import load_profile
 from eval.core.output import remove
@@ -104,6 +106,24 @@ def test_a_pair_is_made_again_when_a_file_that_its_scenario_names_has_changed(tm
     run.cell(str(scenario), 20000, "voxel-diff").unlink()
     assert runner.run(tmp_path / "run", plan)[1] == RunOutcome(1, 0, 0)
     assert len(runner.asked) == 3
+
+
+def test_a_family_of_ones_own_is_the_same_world_from_every_folder(
+    tmp_path: Path, runner: Runner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own, elsewhere = tmp_path / "own" / "families", tmp_path / "elsewhere"
+    own.mkdir(parents=True)
+    elsewhere.mkdir()
+    (own / "sensor.json").write_text(json.dumps(load_profile("os1-32-u0").to_json()))
+    (own / "mine.yaml").write_text(f"extends: {ONE_BOX}\nfamily: {ONE_BOX}\nsensor: {{profile: sensor.json}}\n")
+    monkeypatch.setenv("TUNNELCD_PATH", str(tmp_path / "own"))
+    for folder, outcome in ((tmp_path / "own", RunOutcome(1, 0, 0)), (elsewhere, RunOutcome(0, 1, 0))):
+        monkeypatch.chdir(folder)
+        assert runner.run(tmp_path / "run", plan_of(tmp_path, scenarios="mine"))[1] == outcome
+    # with another file it is another world
+    (own / "sensor.json").write_text((own / "sensor.json").read_text() + "\n")
+    assert runner.run(tmp_path / "run", plan_of(tmp_path, scenarios="mine"))[1] == RunOutcome(1, 0, 0)
+    assert len(runner.asked) == 2
 
 
 def test_a_world_with_settings_that_cannot_be_made_keeps_its_family(tmp_path: Path, runner: Runner) -> None:

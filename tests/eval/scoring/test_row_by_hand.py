@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from contextlib import nullcontext
 from dataclasses import replace
@@ -475,7 +476,9 @@ def test_metrics_of_others_add_columns(
     for columns, told in (
         ({"region_recall": 1.0}, "tunnelcd.metrics: 'third': column 'region_recall' exists already"),
         ({"theirs": 1.0}, "tunnelcd.metrics: 'third': column 'theirs' exists already"),
+        ({"commit": 1.0}, "tunnelcd.metrics: 'third': column 'commit' exists already"),
         ({"new": "high"}, "tunnelcd.metrics: 'third': column 'new' = 'high': expected a number"),
+        ({"new": math.inf}, "tunnelcd.metrics: 'third': column 'new' = inf: expected a number"),
     ):
         metrics["third"] = lambda truth, answer, columns=columns: columns
         with pytest.raises(InputError, match=told):

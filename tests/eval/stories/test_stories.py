@@ -15,9 +15,9 @@ from cdpipe.core.errors import InputError, MergeFailedError
 from cdpipe.descriptors.sphere_network import make_untrained_sphere_network
 from cdpipe.descriptors.weights_file import checkpoint_bytes
 from cdpipe.io.session import read_session
-from cdpipe.model.report import ChangedObject, ChangeReport
+from cdpipe.model.report import ChangedObject, ChangeReport, SurfaceField
 from eval.stories.comparisons import Method, list_sessions
-from eval.stories.places import choose_places, follow_places
+from eval.stories.places import _measure, choose_places, follow_places
 from eval.truth.ground_truth import load_ground_truth
 from scenarios.schema import (
     Drift,
@@ -162,6 +162,25 @@ def test_a_refused_merge_is_a_gap_that_the_page_names(
     moved = pd.read_csv(oracle.out / "displacement.csv").set_index("session")
     assert np.isnan(moved.loc[2, "displacement_m"]) and moved.loc[2, "true_m"] > 0.01
     assert "Session 2: too little overlap" in (oracle.out / "index.html").read_text()
+    assert "<td>session 2</td><td>\u2013</td>" in "".join((oracle.out / "index.html").read_text().split("\n"))
+
+
+def test_without_a_merge_nothing_is_said_of_rock(told: tuple[Path, Story], oracle: Oracle, command: Command) -> None:
+    refusal = MergeFailedError("too little overlap", {"overlap": 0.1})
+    oracle.stop = {f"session-0{number}": refusal for number in range(2, N + 1)}
+    code, out, _ = command("story", told[0], "--out", oracle.out)
+    assert code == 0 and "rock was not measured in any session" in out
+    page = (oracle.out / "index.html").read_text()
+    assert "Rock was not measured" in page and "No region of rock moved" not in page
+
+
+def test_a_level_that_a_point_lacks_is_that_of_the_others() -> None:
+    points = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    for levels_m, level_m, is_beyond in (([0.002, 0.004, np.nan], 0.003, True), ([np.nan] * 3, np.nan, None)):
+        field = SurfaceField(points, np.eye(3), np.full(3, 0.01), np.array(levels_m), np.full(3, -1, np.int32))
+        found = _measure(field, np.zeros(3))
+        np.testing.assert_allclose([found["displacement_m"], found["level_m"]], [0.01, level_m])
+        assert found["is_beyond_level"] is is_beyond
 
 
 def test_without_truth_the_sessions_alone_are_compared(

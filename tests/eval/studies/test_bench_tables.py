@@ -48,6 +48,13 @@ def test_the_program_writes_both_kinds_of_table(tmp_path: Path) -> None:
     assert "| length | mapping | 62.5 to 1000 | 0.8 to 11.2 s | 0.92 (0.74 to 1.10) | rising |" in page
 
 
+def test_an_exponent_of_two_sizes_has_no_interval(tmp_path: Path) -> None:
+    path = tmp_path / "growth.json"
+    path.write_text(json.dumps({"machine": MACHINE, "rows": [GROWTH | {"low": None, "high": None}]}))
+    main([path], tmp_path / "tables.md")
+    assert "| 0.92 | rising |" in (tmp_path / "tables.md").read_text()
+
+
 def test_another_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "profile.json"
     path.write_text(json.dumps({"machine": MACHINE, "rows": [{"stage": "mapping"}]}))
@@ -59,7 +66,7 @@ def test_another_file_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("key", "value"),
     [("machine", {}), ("machine", [1]), ("rows", [ROW, {}]), ("rows", [ROW, ROW | {"name": []}]),
-     ("rows", [ROW | {"value": "much"}]), ("rows", [GROWTH, 3]), ("rows", [GROWTH | {"low": None}])],
+     ("rows", [ROW | {"value": "much"}]), ("rows", [GROWTH, 3]), ("rows", [GROWTH | {"low": "little"}])],
 )  # fmt: skip
 def test_a_damaged_table_is_one_line(key: str, value: object, tmp_path: Path) -> None:
     path = tmp_path / "bench.json"

@@ -100,6 +100,13 @@ def test_a_preset_that_tells_no_sites_apart_has_one_threshold_of_all_pairs() -> 
         find_thresholds(_results(preset="tunnelcd").assign(status="failed"), _regions())
 
 
+def test_a_world_that_was_not_made_has_no_threshold_of_its_own() -> None:
+    made = _results().assign(n_observable=0.0)
+    unmade = made.iloc[[1]].assign(seed=10_009, status="failed", score_radius_m=np.nan, n_observable=np.nan)
+    found = find_thresholds(pd.concat([made, unmade]), _regions())
+    pd.testing.assert_frame_equal(found, find_thresholds(made, _regions()))
+
+
 def test_what_was_withdrawn_cannot_alarm() -> None:
     regions = _regions()
     regions.loc[regions["score"].isin([6.0, 4.0]), ["is_reported", "is_withdrawn"]] = False, True

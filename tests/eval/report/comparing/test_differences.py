@@ -239,6 +239,38 @@ def test_recall_at_a_rate_is_drawn_again_for_both(write: Write) -> None:
     assert (found["n_used"], found["verdict"]) == (8, BETTER)
 
 
+def test_a_method_without_any_candidate_has_recall_0(write: Write) -> None:
+    figures = {"n_observable": 1, "score_radius_m": 4.5, "after_path_m": 2000.0}
+    rows = [row(seed, variant=name, **figures) for seed in range(8) for name in ("a", "b")]
+    names = [{"scenario": "regions/narrow", "seed": seed, "variant": name} for seed in range(8) for name in ("a", "b")]
+    region = {"score": 9.0, "found_changes": "1", "is_withdrawn": False}
+    regions = [{**each, **region} for each in names if each["variant"] == "b"]
+    changes = [{**each, "id": 1, "is_observable": True, "n_truth_cells": 9, "is_found": False} for each in names]
+    folder = write("run", rows, regions=regions, changes=changes)
+    found = the_row(compared(f"{folder}:a", f"{folder}:b"), "recall_at_0.1")
+    assert found[["mean_a", "mean_b", "verdict"]].tolist() == [0.0, 1.0, BETTER]
+
+
+def test_a_world_that_neither_side_could_make_is_no_pair(write: Write) -> None:
+    made = [row(1, region_recall=0.5, n_observable=2), row(2, region_recall=0.5, n_observable=2)]
+    unmade = {**row(3, region_recall=NAN, n_observable=NAN), "status": "failed"}
+    folders = [write(name, [*made, unmade]) for name in "ab"]
+    found = the_row(compared(*folders), "is_answered")
+    assert (found["n_pairs"], found["mean_a"], found["mean_b"]) == (2, 1.0, 1.0)
+
+
+def test_what_a_failed_answer_states_of_its_cost_counts_nowhere(write: Write) -> None:
+    cost = {"t_total_s": 2.0, "bytes_regions_before": 100.0, "region_recall": 0.5}
+    failed = {**row(3, t_total_s=0.0, bytes_regions_before=1.0, region_recall=0.0), "status": "failed"}
+    folders = [write(name, [row(1, **cost), row(2, **cost), failed]) for name in "ab"]
+    table = compared(*folders)
+    assert the_row(table, "t_total_s")["mean_a"] == 2.0
+    assert the_row(table, "bytes_regions_before")["mean_a"] == 100.0
+    assert the_row(table, "region_recall")["n_used"] == 3
+    assert [row["t_total_s"] for row in read_run(folders[0]).results][:2] == [2.0, 2.0]
+    assert np.isnan(float(str(read_run(folders[0]).results[2]["t_total_s"])))
+
+
 def test_other_metrics_versions_are_refused_in_one_line_that_says_how_to_mend(write: Write) -> None:
     old = write("old", [row(1, region_recall=0.5, metrics_version=METRICS_VERSION - 1)])
     new = write("new", [row(1, region_recall=0.5)])

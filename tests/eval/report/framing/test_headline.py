@@ -182,6 +182,25 @@ def test_silence_is_judged_by_the_alarms_on_unchanged_pairs(tmp_path: Path, n_al
     assert write_answer(run(tmp_path, rows), pd.DataFrame()) == f"{silence}: {told}."
 
 
+def test_where_nothing_changed_the_fewest_alarms_lead(tmp_path: Path) -> None:
+    rows = [
+        {"scenario": "narrow", "seed": seed, "variant": name, "is_unchanged_pair": True, "n_observable": 0,
+         "is_alarm": name == "b"}
+        for seed in range(8) for name in "ab"
+    ]  # fmt: skip
+    told = write_answer(run(tmp_path, rows), pd.DataFrame())
+    assert told == "Lowest alarm or no answer where nothing changed, in distribution: a (0.00), before b (1.00)."
+
+
+def test_a_mean_over_fewer_pairs_leads_nothing(tmp_path: Path) -> None:
+    rows = [
+        {"scenario": "narrow", "seed": seed, "variant": name, "region_recall": value}
+        for name, value, n in (("easy", 1.0, 2), ("a", 0.5, 8), ("b", 0.25, 8)) for seed in range(n)
+    ]  # fmt: skip
+    told = write_answer(run(tmp_path, rows), pd.DataFrame())
+    assert told == "Highest region recall, in distribution: a (0.50), before b (0.25)."
+
+
 @pytest.mark.parametrize(("n_wrong", "told"), [(8, "before b (0.00)"), (1, "not told from b (0.88)")])
 def test_merges_are_judged_pair_by_pair(tmp_path: Path, n_wrong: int, told: str) -> None:
     rows = [
@@ -225,6 +244,21 @@ def test_a_plan_with_axes_says_on_how_many_its_leader_holds(tmp_path: Path) -> N
     rows = [{"scenario": "narrow", "variant": name} for name in ("c2c", "tunnelcd")]
     told = write_answer(run(tmp_path, rows, targets={"method": "tunnelcd"}), pd.DataFrame())
     assert told == "Holds on most axes: tunnelcd (1), then c2c (0); tunnelcd breaks at drift (0.2 m)."
+
+
+def test_axes_that_are_not_measured_yet_give_no_leader(tmp_path: Path) -> None:
+    rows = [{"scenario": "narrow", "variant": name} for name in ("c2c", "tunnelcd")]
+    point = {"unit": "m", "value": 0.2, "recall": 0.5, "n_judged": 3, "step": 0}
+    points = [
+        {"axis": axis, "variant": name, "is_measured": axis == "size" or name == "c2c", **point}
+        for axis in ("size", "drift") for name in ("c2c", "tunnelcd")
+    ]  # fmt: skip
+    for table, told in (
+        (points, "tunnelcd breaks nowhere on 1 axes, 1 are not measured yet."),
+        ([each for each in points if each["variant"] == "c2c"], "c2c breaks nowhere."),
+    ):
+        pd.DataFrame(table).to_csv(tmp_path / "breaking_points.csv", index=False)
+        assert write_answer(run(tmp_path, rows, targets={"method": "tunnelcd"}), pd.DataFrame()) == told
 
 
 def test_a_run_of_one_method_names_no_leader(tmp_path: Path) -> None:

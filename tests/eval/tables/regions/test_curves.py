@@ -119,6 +119,14 @@ def test_what_is_looked_at_whatever_the_threshold_counts_at_every_one() -> None:
     assert found_at(ranked_pairs(results(), of_true, changes()), 0.033).tolist() == [True, True, False, False]
 
 
+def test_the_rank_of_what_is_looked_at_anyway_is_that_of_its_score() -> None:
+    # pair 1: at 9 change 1 is found, at 7 both; the candidate at 6 finds what cannot be observed
+    for number in (2, 3):
+        found = regions().assign(is_forced=regions().index == number)
+        ranked = ranked_pairs(results(), found, changes())
+        assert ranked.change_rank.tolist() == [0, 2, 7, 1]
+
+
 def test_proposals_count_where_they_were_proposed() -> None:
     # the candidate at 9 was proposed beside the change 1, on nothing; the one at 7 finds it then
     found = regions()
