@@ -24,7 +24,7 @@ setup: $(VENV)/.installed-dev
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "error: $(PYTHON) is older than 3.11: name a newer one with make PYTHON=python3.12" >&2; exit 2; }
-	$(PYTHON) -m venv $(VENV)
+	$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 2; }
 
 $(VENV)/.installed: $(BIN)/python pyproject.toml constraints.txt
 	$(PIP) --editable .
@@ -71,7 +71,7 @@ $(NEWEST)/.installed: pyproject.toml
 	touch $@
 
 # Plan smoke on each of PYTHONS with the pinned packages: answers and rows are equal to the byte.
-test-pythons: $(BIN)/python $(PYTHONS:%=.venv-%/.installed)
+test-pythons: $(VENV)/.installed $(PYTHONS:%=.venv-%/.installed)
 	rm -rf out/pythons
 	for python in $(PYTHONS); do .venv-$$python/bin/tunnelcd run smoke --out out/pythons/$$python --quiet || exit; done
 	for python in $(wordlist 2,9,$(PYTHONS)); do \
@@ -131,6 +131,7 @@ check: $(VENV)/.installed-dev
 	$(BIN)/lint-imports
 
 report: $(VENV)/.installed
+	@[ -e $(OUT)/provenance.json ] || { echo "error: $(OUT) is no run: make demo first, or name one with make report OUT=..." >&2; exit 2; }
 	$(BIN)/tunnelcd report $(OUT)
 
 clean:

@@ -73,7 +73,7 @@ def detect(
     """
     known = None if before_T_after is None else require_rigid(before_T_after)
     config = load_config(preset, settings, site)
-    require_usable(config)
+    require_usable(config, is_merge_known=known is not None)
     use_threads(THREADS)
     hooks = hooks or Hooks()
     (before, stored_before), (after, stored_after) = (_open(each, config) for each in (before, after))
@@ -91,15 +91,19 @@ def detect(
     return replace(report, seconds={**report.seconds, **mapped.seconds}, coverage=coverage)
 
 
-def require_usable(config: PipelineConfig) -> None:
+def require_usable(config: PipelineConfig, *, is_merge_known: bool = False) -> None:
     """Refuse settings that cannot be run here, before anything is read or mapped.
+
+    Args:
+        config: The settings.
+        is_merge_known: Whether nothing has to be merged.
 
     Raises:
         InputError: An extra is missing, or weights are damaged or read by nobody.
     """
     load_source(config)
     require_method(config.surface.method)
-    if config.merge.method == "kiss-matcher":
+    if config.merge.method == "kiss-matcher" and not is_merge_known:
         require_extra("kiss", "merge.method = kiss-matcher")
     require_weights_are_read(config)
     list_checkpoints(config)

@@ -160,7 +160,6 @@ def map_sources(sources: Sequence[ScanSource], config: PipelineConfig, hooks: Ho
         # check both sessions first: mapping may take minutes
         for source, other in (sources, sources[::-1]):
             check_session(source, config.map, other)
-            require_cells_reach(source, config)
         maps = []
         for name, source in zip(("before", "after"), sources, strict=True):
             on_step = partial(_tell_step, hooks, f"map {name}")
@@ -168,6 +167,8 @@ def map_sources(sources: Sequence[ScanSource], config: PipelineConfig, hooks: Ho
             maps.append(build_map(clear_air(CountedScans(source, on_step), config.map), config.map, on_step=on_step))
         return Done((maps[0], maps[1]))
 
+    for source in sources:  # other settings than those of the maps decide as well
+        require_cells_reach(source, config)
     return hooks.run("maps", config, compute).value
 
 

@@ -23,6 +23,9 @@ from cdpipe.core.files import read_json
 from cdpipe.core.geometry import Float64Array, require_shapes, transform
 from cdpipe.sensor.ouster_metadata import METADATA_FILE, parse_fields, require_mode
 
+BARE_POINTS = "one ray per return"
+"""Product of what stands for the unknown sensor of bare points: a beam that column poses turn to each return."""
+
 
 @dataclass(frozen=True, slots=False, eq=False)
 class SensorMetadata:

@@ -96,7 +96,7 @@ def split_of(seed: int) -> Split:
         return "train"
     if seed < 20_000:
         return "validation"
-    return "test" if seed < 30_000 else "unused"
+    return "test" if seed < 900_000 else "unused"
 
 
 def encode_shard(arrays: Mapping[str, npt.NDArray[Any]], about: Mapping[str, Any]) -> bytes:

@@ -145,14 +145,17 @@ def list_reasons(rows: Sequence[Row]) -> list[str]:
     return [f"{row['name']}: {row['reason']}" for row in rows if row["reason"]]
 
 
-def require_writable(path: Path) -> None:
-    """Check before the measurement that the table can be written.
+def require_writable(path: Path, *, growth: bool = False, profile: bool = False) -> None:
+    """Check before the measurement that the table, and what is written beside it, can be written.
 
     Raises:
         InputError: It cannot.
     """
     if path.is_dir():
         raise InputError(f"{path}: is a folder: name a file for the table")
+    beside = (".csv", ".png") * growth + (".md",) * profile
+    if path.suffix in beside:
+        raise InputError(f"{path}: a file of this name is written beside the table: name one that ends in .json")
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: a device or a pipe: name a file for the table")
     make_writable(path.absolute().parent)

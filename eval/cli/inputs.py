@@ -231,7 +231,8 @@ def sampled_points(source: ScanSource, most: int) -> Any:
     from cdpipe.core.geometry import transform
 
     n_scans = len(source.odom_T_sensor)
-    step = max(1, n_scans // 200)
+    # each station of a whole map has the points that are nearest to it
+    step = 1 if getattr(source, "is_whole_map", False) else max(1, n_scans // 200)
     kept = []
     share = -(-most // -(-n_scans // step))
     for scan in source.scans():

@@ -122,8 +122,9 @@ def _gather_means(folder: Path, *, wide: bool) -> tuple[list[_Table], list[str]]
     from eval.running.predictions import list_incomplete_variants
     from eval.running.runfolder import RunFolder
     from eval.tables.merge_table import merge_overview
+    from eval.tables.rows import without_costs_of_failures
 
-    results = pd.read_csv(folder / "results.csv")
+    results = without_costs_of_failures(pd.read_csv(folder / "results.csv"))
     cases = zip(results["scenario"], results["seed"].astype(int), results["variant"], strict=True)
     provenance = RunFolder(folder).stored_provenance()
     covered = measure_coverage(provenance, cases)

@@ -17,9 +17,8 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.io.session import ScanChunk, Session, fit_chunk
 from cdpipe.model.types import PosedScan, ScanSource
-from cdpipe.sensor.ouster import SensorMetadata
+from cdpipe.sensor.ouster import BARE_POINTS, SensorMetadata
 
-_PRODUCT = "one ray per return"
 _MOST_RAYS = 262_144
 _CHUNK_SCANS = 16
 
@@ -54,7 +53,7 @@ def as_session(source: ScanSource) -> CloudSession:
     width = max(_count(source), default=0)
     if width > _MOST_RAYS:
         raise InputError(f"{source.name}: a scan has {width} returns: {_MOST_RAYS} at most can be grafted; thin it")
-    sensor = SensorMetadata(_PRODUCT, "none", f"{width}x10", np.zeros(1), np.zeros(1), 0.0, np.eye(4), (0,))
+    sensor = SensorMetadata(BARE_POINTS, "none", f"{width}x10", np.zeros(1), np.zeros(1), 0.0, np.eye(4), (0,))
     chunk_scans = fit_chunk(1, width, _CHUNK_SCANS)
     path, poses = Path(source.name), np.asarray(source.odom_T_sensor)
     return CloudSession(path, sensor, poses, chunk_scans, {"recording": path.name}, source=source)

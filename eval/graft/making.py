@@ -78,7 +78,9 @@ def open_recorded(recording: Recording, on_progress: Progress = report_nothing) 
         if len(sessions) == 1:
             yield Recorded(sessions)
         elif recording.before_T_after is not None:
-            yield Recorded(sessions, read_known_merge(Path(recording.before_T_after)), "given")
+            names = enumerate(recording.sessions)
+            origins_m = [_how(recording, number).subtracted_m(Path(name)) for number, name in names]
+            yield Recorded(sessions, read_known_merge(Path(recording.before_T_after), origins_m), "given")
         else:
             yield Recorded(sessions, _find_merge(sessions, on_progress), "tunnelcd")
 

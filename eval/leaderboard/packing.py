@@ -25,7 +25,15 @@ from eval.leaderboard.calls import (
     read_call,
     read_evaluation,
 )
-from eval.leaderboard.submission import FILES, MANIFEST, MOST_BYTES, PairPart, Submission, member_name
+from eval.leaderboard.submission import (
+    FILES,
+    MANIFEST,
+    MOST_BYTES,
+    PairPart,
+    Submission,
+    check_rows,
+    member_name,
+)
 from eval.running.runfolder import RunFolder, json_text
 from eval.scoring.scoring import METRICS_VERSION
 
@@ -77,6 +85,10 @@ def pack_submission(run: RunFolder, name: str, out: Path) -> int:
 def _require_readable(name: str, manifest: bytes, document: Submission) -> None:
     """Refuse to pack what `read_submission` would not read."""
     n_bytes = len(manifest) + sum(part.n_bytes for pair in document.pairs for part in pair.files.values())
+    try:
+        check_rows(document)
+    except ValueError as error:
+        raise InputError(f"{name}: {error}: a leaderboard would not read it") from error
     try:
         parse_json(manifest)
         if n_bytes > MOST_BYTES:

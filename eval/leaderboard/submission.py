@@ -122,7 +122,7 @@ def read_submission(path: Path) -> CheckedFile:
             raise ValueError(f"no {MANIFEST} in it")
         content = parse_json(read_member(archive, members[MANIFEST]).tobytes())
         document = validate(Submission, Document(f"{path}:{MANIFEST}", content))
-        _check_rows(document)
+        check_rows(document)
         declared = {
             member_name(number, file): part
             for number, pair in enumerate(document.pairs)
@@ -185,7 +185,7 @@ def _iterate_answers(found: CheckedFile) -> Iterator[tuple[PairPart, dict[str, b
             yield pair, {file: read_member(archive, member).tobytes() for file, member in names.items()}
 
 
-def _check_rows(document: Submission) -> None:
+def check_rows(document: Submission) -> None:
     """Refuse rows that are not of their pairs, and values that no table can hold."""
     if document.metrics_version != METRICS_VERSION:
         raise ValueError(

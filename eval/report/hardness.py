@@ -74,7 +74,7 @@ def name_breaks(points: pd.DataFrame, variant: str) -> str:
     if broken:
         return f"{variant} breaks at {', '.join(broken)}"
     n_left = len(its) - len(own)
-    return f"{variant} breaks nowhere" + (f" on {len(own)} axes, {n_left} are not measured yet" if n_left else "")
+    return f"{variant} breaks nowhere" + (f" so far ({len(own)} of {len(its)} axes measured)" if n_left else "")
 
 
 def _at(row: Mapping[str, Any]) -> str:

@@ -100,7 +100,10 @@ def run_plan(
         if earlier and not run.stored_provenance():  # an interrupt may leave cells of it
             write_json(run.path / "provenance.json", {**earlier, "finished": None})
         mirror.fetch(run, progress)
-    pairs = schedule_pairs(run, plan, all_cells, force, tools, shard=shard, keep=keep, is_lean=True, progress=progress)
+    # sessions that lack are made from their scenarios
+    pairs = schedule_pairs(
+        run, plan, all_cells, force, tools, shard=shard, keep=keep, is_lean=keep != "sessions", progress=progress
+    )
     n_todo = sum(len(pair.todo) for pair in pairs)
     chosen = limit_pairs(pairs, limit)
     n_run = sum(len(pair.todo) for pair in chosen)
@@ -123,7 +126,7 @@ def run_plan(
             _remove_stale(run, pair, force)
         if mirror is not None:
             mirror.forget(run, pairs)
-            mirror.start(run)
+            mirror.copy_cells(run)
         done = None if mirror is None else partial(mirror.copy_pair, run)
         if client is None:
             _run_here(run, chosen, made, progress, tools, done)
@@ -133,10 +136,10 @@ def run_plan(
     if results is None:
         results = write_tables(run)
         write_json(run.path / "provenance.json", {**provenance, "finished": provenance["finished"] or tools.now()})
-    _settle(run, pairs, keep, progress, tools)
     if mirror is not None:
-        mirror.copy_missing(run)
+        mirror.copy_cells(run)
         mirror.copy_tables(run)
+    _settle(run, pairs, keep, progress, tools)
     n_died = int((results["status"] == "worker_died").sum())
     return RunOutcome(n_run, len(own_cells) - n_todo, n_todo - n_run, n_died)
 
@@ -154,6 +157,7 @@ def list_cells(
     Raises:
         InputError: A setting is wrong, or the folder holds something else than a run.
     """
+    _require_either(force, limit)
     run = RunFolder(path)
     if path.is_dir() and any(path.iterdir()):
         _require_one_split(str(path), run.provenance(), plan)
@@ -309,7 +313,9 @@ def _settle(run: RunFolder, pairs: Sequence[Pair], keep: Keep | None, progress: 
                 remake_pair(run, pair.name, pair.seed, progress, tools)
             elif not run.pair(pair.name, pair.seed).is_dir():  # removed by hand, or left behind by `merge-runs`
                 with pair_lock(run, pair):
-                    PairRun(run, pair, Made(None), progress, tools).open()
+                    opened = PairRun(run, pair, Made(None), progress, tools).open()
+                if isinstance(opened, str):
+                    progress.note(f"{pair.name} {pair.seed}: cannot be made: {opened}")
         elif keep == "nothing" or run.pair(pair.name, pair.seed).is_dir():
             with pair_lock(run, pair):
                 drop_pair(run, pair.name, pair.seed, keep)

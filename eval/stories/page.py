@@ -133,7 +133,8 @@ def _displacement_cell(row: pd.Series, *, has_truth: bool) -> Cell:
     if not np.isfinite(row["displacement_m"]):
         return Cell(UNDEFINED, interval=true)
     level = f"{1000 * row['level_m']:.1f}" if np.isfinite(row["level_m"]) else UNDEFINED
-    return Cell(f"{_mm(row['displacement_m'])} \u00b1 {level}", row["is_beyond_level"] is True, true)
+    is_beyond = row["is_beyond_level"]
+    return Cell(f"{_mm(row['displacement_m'])} \u00b1 {level}", pd.notna(is_beyond) and bool(is_beyond), true)
 
 
 def _mm(value_m: float) -> str:

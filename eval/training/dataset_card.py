@@ -110,7 +110,7 @@ def card(rows: Sequence[Row], recipe: Mapping[str, Any], commands: Sequence[str]
 
 {_what(rows)}; between the drives, objects are added, removed or
 moved.
-{one}, and a tunnel is of one split: seeds below 10000 train, 10000 to 19999 validate, 20000 to 29999
+{one}, and a tunnel is of one split: seeds below 10000 train, 10000 to 19999 validate, 20000 to 899999
 test and are never trained on.
 
 {_counts_table(made)}

@@ -30,6 +30,7 @@ from eval.plans.worlds import world_slug
 from eval.running.runfolder import read_json, write_json
 from eval.training.dataset import Recipe, make_shards, shard_digest
 from eval.training.dataset_card import write_card
+from scenarios.grafted import GraftScenario
 from scenarios.library import load_scenario
 
 _AHEAD = 2  # tunnels that wait in a cluster for each worker; more would only take memory
@@ -167,7 +168,10 @@ def _tunnels(families: Sequence[str], seeds: str, recipe: Recipe) -> list[Tunnel
 
 def _tunnel(family: str, seed: int, recipe: Recipe) -> Tunnel:
     try:
-        return Tunnel(family, seed, shard_digest(load_scenario(family, seed, recipe.settings), seed, recipe))
+        scenario = load_scenario(family, seed, recipe.settings)
+        if recipe.afters > 1 and isinstance(scenario, GraftScenario):
+            raise InputError(f"--afters {recipe.afters}: the sessions of {family} are recorded: leave it out")
+        return Tunnel(family, seed, shard_digest(scenario, seed, recipe))
     except ScenarioError as error:
         return Tunnel(family, seed, refused=str(error))
 

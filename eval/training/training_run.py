@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch
 
@@ -165,12 +166,19 @@ def _make_task(name: str, training: Sequence[TunnelShard], validation: Sequence[
     return PlaceTask(make_untrained_network(seed), read_place_data(training), read_place_data(validation), seed)
 
 
+def _name_ranges(seeds: Sequence[int]) -> str:
+    """Return seeds as ranges, ends excluded: `3:5, 50:51`."""
+    numbers = np.unique(seeds)
+    parts = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
+    return ", ".join(f"{part[0]}:{part[-1] + 1}" for part in parts)
+
+
 def _described(tunnels: Sequence[TunnelShard], data_digest: str) -> dict[str, Any]:
     seeds = [tunnel.seed for tunnel in tunnels]
     n_tunnels = len({(tunnel.family, tunnel.seed) for tunnel in tunnels})
     return {
         "families": sorted({tunnel.family for tunnel in tunnels}),
-        "seeds": f"{min(seeds)}:{max(seeds) + 1}",
+        "seeds": _name_ranges(seeds),
         "n_tunnels": n_tunnels,
         **({"n_after_sessions": len(tunnels)} if len(tunnels) > n_tunnels else {}),
         "n_keyframes": sum(tunnel.n_before for tunnel in tunnels),

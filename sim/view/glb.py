@@ -26,7 +26,8 @@ def write_glb(view: View, path: Path) -> tuple[int, int]:
     n_triangles = 0
     for surface in (*view.bands, *view.surfaces):
         mesh = trimesh.Trimesh(surface.mesh.vertices, surface.mesh.faces, process=False)
-        mesh.visual.vertex_colors = np.tile([*surface.rgb, 255], (len(mesh.vertices), 1)).astype(np.uint8)
+        linear = 255.0 * (np.array(surface.rgb) / 255.0) ** 2.2  # glTF 2.0, section 3.7.2.1: COLOR_0 is linear
+        mesh.visual.vertex_colors = np.tile([*np.rint(linear), 255], (len(mesh.vertices), 1)).astype(np.uint8)
         scene.add_geometry(mesh, node_name=surface.name, geom_name=surface.name)
         n_triangles += len(mesh.faces)
     n_meshes = len(scene.geometry)

@@ -60,12 +60,14 @@ def _as_16_bits(cloud: PointMap) -> np.ndarray[Any, np.dtype[np.uint16]]:
 
 
 def write_ply(path: Path, cloud: PointMap) -> None:
-    """Write a map as binary PLY of 32-bit numbers; `time` counts from the first point.
+    """Write a map as binary PLY of 32-bit numbers; `time` counts from the first point of its session.
 
     Raises:
         OSError: The file cannot be written.
     """
     scalars = dict(cloud.scalars)
     if "time" in scalars and len(cloud.points):
-        scalars["time"] = scalars["time"] - scalars["time"].min()
+        sessions = scalars.get("session", np.zeros(len(cloud.points)))
+        first_s = {each: scalars["time"][sessions == each].min() for each in np.unique(sessions)}
+        scalars["time"] = scalars["time"] - np.array([first_s[each] for each in sessions])
     write_ply_points(path, cloud.points, scalars)

@@ -17,6 +17,7 @@ from cdpipe.io.foreign.scans import PosedClouds
 from cdpipe.io.readers import RecordedScans
 from cdpipe.io.session import ScanChunk
 from cdpipe.model.types import PosedScan, ScanSource
+from cdpipe.sensor.ouster import BARE_POINTS
 
 Fields = Callable[[int, Int32Array], Mapping[str, npt.NDArray[Any]]]
 """Returns further values (N,) by name of the returns at (N,) pixels of a scan, given its index."""
@@ -81,7 +82,7 @@ class Outgoing:
     def start_ns(self) -> int:
         """Time of the recording's clock from which stamps of its scans count."""
         if self.session is not None:
-            return int(self.session.provenance.get("sensor_clock_start_ns", START_NS))
+            return int(self.session.provenance.get("sensor_clock_start_ns") or START_NS)  # 0 is no time to readers
         return round(float(self._posed_clouds().stamps_s[0]) * 1e9)
 
     def span_s(self) -> tuple[float, float]:
@@ -126,12 +127,13 @@ class Outgoing:
     def sweeps(self, report: Progress) -> Iterator[OutScan]:
         """Read the scans in order as the sensor measures them: stamped at their first column, and not deskewed.
 
-        Those of a recording that is no session are deskewed, and without offsets.
+        Those of a recording that is no session are deskewed, and without offsets. So are those of a session with a ray
+        for each return, which `graft` makes of bare points: its columns are no sweep.
 
         Raises:
             InputError: As `ScanSource.scans`.
         """
-        if self.session is None:
+        if self.session is None or self.session.sensor.product == BARE_POINTS:
             yield from (replace(scan, offset_ns=None) for scan in self.scans(report))
             return
         chunks = enumerate(self.session.chunks())

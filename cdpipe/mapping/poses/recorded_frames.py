@@ -49,7 +49,7 @@ def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) 
     recorded_T_keyframe = odom_T_keyframe if after.recorded_T_sensor is None else after.recorded_T_sensor[scans]
     recorded_local = recorded @ map_T_keyframe @ invert(recorded_T_keyframe)
     before_T_after = report.before_T_after
-    if not (_is_as_recorded(before) and _is_as_recorded(after)):
+    if len(scans) and not (_is_as_recorded(before) and _is_as_recorded(after)):
         gaps_m = np.asarray(cKDTree(before.odom_T_keyframe[:, :3, 3]).query(map_T_keyframe[:, :3, 3])[0])
         shared = gaps_m <= _SHARED_M if gaps_m.min() <= _SHARED_M else np.ones(len(scans), dtype=np.bool_)
         before_T_after = fit_rigid(recorded_T_keyframe[shared, :3, 3], recorded_local[shared])

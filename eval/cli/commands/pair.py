@@ -104,7 +104,7 @@ def detect(
     hows = how_to_read(2, form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin)
     origins_m = [how.subtracted_m(path) for how, path in zip(hows, (before, after), strict=True)]
     known = _read_known_merge(before_T_after, origins_m, assume_aligned=assume_aligned)
-    cdpipe.require_usable(config)  # before hours of reading
+    cdpipe.require_usable(config, is_merge_known=known is not None)  # before hours of reading
     try:
         with shown_warnings(), new_folder(out) as partial, shown_progress(quiet) as progress:
             earlier, later = open_inputs([before, after], hows, progress)

@@ -64,7 +64,7 @@ def bench(
 
     _require_one_table(growth=growth, profile=profile, surface=surface, quick=quick, large=large)
     if out is not None:
-        require_writable(out)
+        require_writable(out, growth=growth, profile=profile)
     # lines, never bars: the time of a thread that redraws bars would be measured as well
     tell = (Silent() if quiet else Lines()).cells
     written: list[Path] = []

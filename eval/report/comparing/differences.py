@@ -55,7 +55,8 @@ def compare(a: Side, b: Side, *, times_count: bool = True, seed: int = 0) -> pd.
     check_versions(a, b)
     check_extras(a)
     check_extras(b)
-    figures = [figures_of(with_pair(side.results)) for side in (a, b)]
+    unmade = [set(_pairs(side.results)) - set(_pairs(with_pair(side.results))) for side in (a, b)]
+    figures = [figures_of(_without(side.results, unmade[0] & unmade[1])) for side in (a, b)]
     rows: list[dict[str, Any]] = []
     for variants in matched_variants(a, b):
         own = [frame[frame["variant"] == name] for frame, name in zip(figures, variants, strict=True)]
@@ -74,6 +75,15 @@ def compare(a: Side, b: Side, *, times_count: bool = True, seed: int = 0) -> pd.
         row["verdict"] = verdict(row) if is_judged else NOT_JUDGED
     rows.sort(key=_place)
     return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def _pairs(results: pd.DataFrame) -> pd.MultiIndex:
+    return pd.MultiIndex.from_frame(results[PAIR])
+
+
+def _without(results: pd.DataFrame, pairs: set[Any]) -> pd.DataFrame:
+    """Return the rows of results.csv that are of none of some pairs, whose worlds neither side could make."""
+    return results[~_pairs(results).isin(list(pairs))] if pairs else results
 
 
 def paired_differences(a: pd.DataFrame, b: pd.DataFrame, seed: int = 0) -> list[dict[str, Any]]:

@@ -26,7 +26,9 @@ from sim.view.returns import CHANGE_RGB, Cloud, Rgb
 from sim.view.view import Label, Line, View
 from sim.view.viewer import write_html
 
-_TRUTH_RGB: dict[str, Rgb] = {"found": (0, 120, 90), "missed": WRONG_RGB, "unobservable": (150, 150, 150)}
+_TRUTH_RGB: dict[str, Rgb] = {
+    "found": (0, 120, 90), "missed": WRONG_RGB, "unobservable": (150, 150, 150), "not scored": (60, 60, 60),
+}  # fmt: skip
 _REGION_RGB: dict[str, Rgb] = {"true": REGION_RGB, "false": WRONG_RGB}
 _MAP_POINT_M, _OBJECT_POINT_M = 0.05, 0.09
 _MARGIN_M = 0.15
@@ -120,8 +122,9 @@ def case_view(
 def _states(truth: GroundTruth, rows: Sequence[Row]) -> list[str]:
     """Return what became of each change."""
     is_found = {int(number(row, "id")): flag(row, "is_found") for row in rows}
+    rest = "missed" if rows else "not scored"
     return [
-        "unobservable" if not is_observable else "found" if is_found.get(change.id) else "missed"
+        "unobservable" if not is_observable else "found" if is_found.get(change.id) else rest
         for change, is_observable in zip(truth.pair.changes, truth.is_observable, strict=True)
     ]
 

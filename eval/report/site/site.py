@@ -154,7 +154,8 @@ def region_picture(
     states = [mark.state for mark in marks]
     n_false = sum(mark.is_false for mark in regions)
     count = "1 region" if len(regions) == 1 else f"{len(regions)} regions"
-    words = [f"{count}{_name_radii(regions)} reported, {n_false} of them false."]
+    false = f", {n_false} of them false" if outcomes or not regions else ""  # without regions.csv it is not known
+    words = [f"{count}{_name_radii(regions)} reported{false}."]
     if states and "not scored" not in states:
         n_observable = len(states) - states.count("unobservable")
         words.append(f"{states.count('found')} of {n_observable} observable changes found.")

@@ -6,6 +6,8 @@ scenario as drawn and the seed, and the digest of all of its files (`eval.runnin
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -91,9 +93,23 @@ def remove_leftovers(run: RunFolder) -> None:
 
 
 def digest_files(pair: Path) -> str:
-    """Return the digest of all files of a pair that the simulator writes."""
+    """Return the digest of all files of a pair that the simulator writes.
+
+    Where its scenario names files, those stand in JSON by their digests: paths depend on the working folder.
+    """
     files = [path for path in pair.rglob("*") if path.is_file()]
-    return files_digest(pair, [path for path in files if _DERIVED.isdisjoint(path.relative_to(pair).parts)])
+    own = [path for path in files if _DERIVED.isdisjoint(path.relative_to(pair).parts)]
+    named = read_pair_truth(pair).files if (pair / "truth").is_dir() else {}
+    if not named:
+        return files_digest(pair, own)
+    return digest({path.relative_to(pair).as_posix(): _digest_without_paths(path, named) for path in own})
+
+
+def _digest_without_paths(file: Path, named: Mapping[str, str]) -> str:
+    content = file.read_bytes()
+    for path, found in named.items() if file.suffix == ".json" else ():
+        content = content.replace(json.dumps(path).encode(), json.dumps(found).encode())
+    return hashlib.sha256(content).hexdigest()
 
 
 def dropped_file(run: RunFolder, world: str, seed: int) -> Path:

@@ -46,7 +46,6 @@ class Mirror:
             raise InputError("a URL with a password would stand in provenance.json: leave it to fsspec's configuration")
         self.url = url
         self._fs, self._root = _open(url)
-        self._same: dict[str, int] = {}  # cells that are alike here and there, and when they were written here
 
     def provenance(self) -> dict[str, Any]:
         """Return the provenance of the run there; {} where there is none.
@@ -76,7 +75,6 @@ class Mirror:
         """
         names = [name for name in self._list("cells") if _CELL.fullmatch(name) and not (run.path / name).exists()]
         self._get(run.path, names, progress or Silent())
-        self._same |= {name: (run.path / name).stat().st_mtime_ns for name in names}
 
     def fetch_all(self, folder: Path, progress: RunProgress | None = None) -> None:
         """Take provenance, cells and answers into an empty folder.
@@ -104,46 +102,48 @@ class Mirror:
                 if name.rpartition("/")[0] in running and not (run.path / name).exists():
                     self._fs.rm_file(self._place(name))
 
-    def start(self, run: RunFolder) -> None:
-        """Copy the provenance, so that a copy which an interrupt cuts short is one of a run.
-
-        Raises:
-            InputError: The place cannot be written.
-        """
-        self._put(run, [run.path / "provenance.json"])
-
     def copy_pair(self, run: RunFolder, pair: Pair) -> None:
         """Copy the answers of the cells of a pair that ran, and then the cells, whose files say that they are finished.
 
         Raises:
             InputError: The place cannot be written.
         """
-        for each in pair.todo:
-            self._copy_cell(run, run.cell(pair.name, pair.seed, each.cell.variant))
+        cells = [run.cell(pair.name, pair.seed, each.cell.variant) for each in pair.todo]
+        for cell in cells:
+            self._copy_cell(run, cell)
+        self._note_copied(run, cells)
 
-    def copy_missing(self, run: RunFolder) -> None:
-        """Copy the finished cells that are not there, or were written since the last copy ended.
+    def copy_cells(self, run: RunFolder) -> None:
+        """Copy provenance, and the finished cells that are not there or were written here since the last copy.
 
-        Those are of an interrupted pair, or of a command that was not told of the copy.
+        The first are of an interrupted pair, or of a run that began without a copy; the others of a command that was
+        not told of it. With its provenance a copy that an interrupt cuts short is one of a run.
 
         Raises:
             InputError: The place cannot be written.
         """
-        stored, record = set(self._list("cells")), run.path / _RECORD
-        copied_ns = read_json(record).get(self.url, 0)
-        cells = {_relative(run, path): path for path in sorted(run.path.glob("cells/*/*/*.json"))}
-        written_ns = {name: path.stat().st_mtime_ns for name, path in cells.items()}
-        for name, path in cells.items():
-            is_old = isinstance(copied_ns, int) and written_ns[name] <= copied_ns
-            if name not in stored or not (is_old or self._same.get(name) == written_ns[name]):
-                self._copy_cell(run, path)
-        write_json(record, {**read_json(record), self.url: max(written_ns.values(), default=0)})
+        self._put(run, [run.path / "provenance.json"])
+        stored, copied_ns = set(self._list("cells")), read_json(run.path / _RECORD).get(self.url)
+        cells = sorted(run.path.glob("cells/*/*/*.json"))
+        for cell in cells:
+            is_newer = isinstance(copied_ns, int) and cell.stat().st_mtime_ns > copied_ns
+            if is_newer or _relative(run, cell) not in stored:
+                self._copy_cell(run, cell)
+        if cells:
+            self._note_copied(run, cells)
+
+    def _note_copied(self, run: RunFolder, cells: Iterable[Path]) -> None:
+        """Note when the newest cell was written that is there; one that is newer is copied again."""
+        noted = read_json(run.path / _RECORD)
+        times_ns = [cell.stat().st_mtime_ns for cell in cells if cell.exists()]
+        earlier = noted.get(self.url)
+        write_json(
+            run.path / _RECORD, {**noted, self.url: max([earlier if isinstance(earlier, int) else 0, *times_ns])}
+        )
 
     def _copy_cell(self, run: RunFolder, cell: Path) -> None:
         answer = run.path / "answers" / cell.relative_to(run.path / "cells").with_suffix("")
-        written_ns = cell.stat().st_mtime_ns
         self._put(run, [*(answer / name for name in _ANSWER if (answer / name).is_file()), cell])
-        self._same[_relative(run, cell)] = written_ns
 
     def copy_tables(self, run: RunFolder) -> None:
         """Copy provenance and tables.

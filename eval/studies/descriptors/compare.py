@@ -83,6 +83,8 @@ def measure(
         document = read_json(path)
         if document.get("key") != key or not _are_rows(document.get("rows")):
             pair = out / "pairs" / path.stem
+            if document.get("key") != key:  # what lies there is of another world, or cut short
+                remove(pair)
             try:
                 if not pair.exists():
                     pair.parent.mkdir(parents=True, exist_ok=True)
@@ -181,7 +183,7 @@ def tabulate_spheres(rows: pd.DataFrame) -> pd.DataFrame:
                     "group": group,
                     "precision": precision,
                     **_mean(cases, "region_auroc"),
-                    **_mean(loss.to_frame("auroc_loss"), "auroc_loss"),
+                    **_mean(loss.rename("auroc_loss").reset_index(), "auroc_loss"),
                     "auroc_loss_most": float(loss.max()),
                     "n_pairs": len(cases),
                     "n_used": int(cases["region_auroc"].notna().sum()),

@@ -60,7 +60,7 @@ def test_no_seed_crosses_splits(folder: Path) -> None:
     assert listed == {"train": {0, 9999}, "validation": {10000, 19999}}
     borders = {0: "train", 9999: "train", 10000: "validation", 19999: "validation", 20000: "test", 29999: "test"}
     assert {seed: split_of(seed) for seed in borders} == borders
-    assert split_of(30000) == split_of(900000) == "unused"
+    assert split_of(30000) == split_of(899999) == "test" and split_of(900000) == "unused"
 
 
 @pytest.mark.parametrize("split", ["test", "unused", "all", ""])

@@ -189,3 +189,11 @@ def test_a_real_row_of_a_small_world() -> None:
     assert row["met"] == (row["ratio"] >= row["target"])
     assert (row["unit"], row["n"]) == ("Mray/s", 2)
     json.dumps(table)
+
+
+@pytest.mark.parametrize(("option", "name"), [("--growth", "g.csv"), ("--growth", "g.png"), ("--profile", "p.md")])
+def test_a_table_takes_no_name_of_a_file_beside_it(
+    option: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, err = run(capsys, option, "--out", str(tmp_path / name))
+    assert code == 2 and "is written beside the table: name one that ends in .json" in err

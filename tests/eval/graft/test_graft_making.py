@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import invert, transform
 from cdpipe.io.foreign import HowToRead
+from cdpipe.io.out.scans import START_NS, Outgoing
 from cdpipe.io.ply import write_ply_points
 from cdpipe.io.readers import RecordedScans, open_session
 from cdpipe.io.session import read_session
@@ -221,3 +223,19 @@ def test_what_cannot_be_grafted_is_one_line(
     assert told in err
     assert "Traceback" not in err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_scans_of_bare_points_leave_as_they_are_and_not_as_a_sweep(simulated: Path) -> None:
+    session = as_session(open_session(simulated / "before"))
+    source = RecordedScans(session)
+    whole, swept = (list(read(lambda *_: None)) for read in (Outgoing(source).scans, Outgoing(source).sweeps))
+    for one, other in zip(whole, swept, strict=True):
+        np.testing.assert_array_equal(other.points, one.points)
+        assert other.offset_ns is None and len(other.path_ns) == 1
+
+
+def test_a_clock_that_begins_at_0_tells_no_time(simulated: Path) -> None:
+    session = read_session(simulated / "before")
+    for start_ns, told in ((0, START_NS), (7, 7), (None, START_NS)):
+        given = {} if start_ns is None else {"sensor_clock_start_ns": start_ns}
+        assert Outgoing(RecordedScans(replace(session, provenance=given))).start_ns == told

@@ -142,6 +142,14 @@ def test_what_would_not_be_read_is_not_packed(
     assert not (tmp_path / "x.zip").exists()
 
 
+def test_figures_that_no_table_holds_are_not_packed(run: RunFolder, tmp_path: Path) -> None:
+    cell = run.cell(ONE_BOX, 20000, "mine")
+    document = json.loads(cell.read_text())
+    write_json(cell, {**document, "row": {**document["row"], "theirs": 1e300}})
+    with pytest.raises(InputError, match=r"theirs = 1e\+300: larger than any figure is: a leaderboard would not read"):
+        pack_submission(run, "mine", tmp_path / "x.zip")
+
+
 def test_programs_of_one_name_keep_their_digests(run: RunFolder, tmp_path: Path) -> None:
     own = run.path / "evaluations" / "mine" / "evaluation.json"
     document = json.loads(own.read_text())

@@ -17,6 +17,7 @@ from cdpipe.descriptors.weights_file import checkpoint_bytes
 from cdpipe.io.session import read_session
 from cdpipe.model.report import ChangedObject, ChangeReport, SurfaceField
 from eval.stories.comparisons import Method, list_sessions
+from eval.stories.page import displacement_table
 from eval.stories.places import _measure, choose_places, follow_places
 from eval.truth.ground_truth import load_ground_truth
 from scenarios.schema import (
@@ -172,6 +173,15 @@ def test_without_a_merge_nothing_is_said_of_rock(told: tuple[Path, Story], oracl
     assert code == 0 and "rock was not measured in any session" in out
     page = (oracle.out / "index.html").read_text()
     assert "Rock was not measured" in page and "No region of rock moved" not in page
+
+
+def test_what_is_beyond_its_level_is_bold() -> None:
+    place = {"place": "A", "x_m": 0.0, "y_m": 0.0, "z_m": 0.0, "displacement_m": 0.01, "true_m": 0.01}
+    rows = [{**place, "session": 2, "level_m": 0.004, "is_beyond_level": True},
+            {**place, "session": 3, "level_m": 0.04, "is_beyond_level": False}]  # fmt: skip
+    for more in ([], [{**place, "session": 4, "level_m": np.nan, "is_beyond_level": None}]):
+        ((_, cells),) = displacement_table(pd.DataFrame([*rows, *more]), has_truth=False).rows
+        assert [cell.is_best for cell in cells[2:4]] == [True, False]
 
 
 def test_a_level_that_a_point_lacks_is_that_of_the_others() -> None:

@@ -336,6 +336,14 @@ def test_several_after_sessions_are_shards_of_one_tunnel(
     assert np.unique(read_place_data(tunnels).tunnels).tolist() == [0, 1]
 
 
+def test_a_recorded_world_has_no_further_after_sessions(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "friday.yaml").write_text("recording: {sessions: [run]}\nprops: []\n")
+    with pytest.raises(InputError, match=r"--afters 2: the sessions of .* are recorded: leave it out"):
+        make_dataset([str(tmp_path / "friday.yaml")], "0:2", replace(RECIPE, afters=2), tmp_path / "d")
+    assert not (tmp_path / "d").exists()
+
+
 def test_a_second_after_session_has_the_same_before_session_and_changes(tmp_path: Path, shard: Shard) -> None:
     read = []
     for number, content in enumerate(make_shards(FAMILY, SEED, replace(RECIPE, afters=2))):

@@ -257,6 +257,9 @@ def test_a_world_that_neither_side_could_make_is_no_pair(write: Write) -> None:
     folders = [write(name, [*made, unmade]) for name in "ab"]
     found = the_row(compared(*folders), "is_answered")
     assert (found["n_pairs"], found["mean_a"], found["mean_b"]) == (2, 1.0, 1.0)
+    whole = write("c", [*made, row(3, region_recall=0.5, n_observable=2)])
+    found = the_row(compared(whole, folders[1]), "is_answered")
+    assert (found["n_pairs"], found["mean_a"], round(found["mean_b"], 3)) == (3, 1.0, 0.667)
 
 
 def test_what_a_failed_answer_states_of_its_cost_counts_nowhere(write: Write) -> None:

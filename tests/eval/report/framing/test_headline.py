@@ -254,7 +254,7 @@ def test_axes_that_are_not_measured_yet_give_no_leader(tmp_path: Path) -> None:
         for axis in ("size", "drift") for name in ("c2c", "tunnelcd")
     ]  # fmt: skip
     for table, told in (
-        (points, "tunnelcd breaks nowhere on 1 axes, 1 are not measured yet."),
+        (points, "tunnelcd breaks nowhere so far (1 of 2 axes measured)."),
         ([each for each in points if each["variant"] == "c2c"], "c2c breaks nowhere."),
     ):
         pd.DataFrame(table).to_csv(tmp_path / "breaking_points.csv", index=False)

@@ -21,6 +21,7 @@ from eval.running.scaling.merging import merge_runs
 from eval.running.scaling.remaking import remade_below, remade_when_asked, remake_pair
 from eval.running.scaling.shards import Shard
 from scenarios.schema import Scenario
+from sim.session.truth import read_pair_truth, write_pair_truth
 from tests.eval.running.scaling.conftest import VARIANT, WORLDS, Runner, load_small
 from tests.same_numbers import differences
 
@@ -122,6 +123,17 @@ def test_a_folder_above_a_pair_does_not_change_its_digest(shards: list[Path], tm
     assert digest_files(copy) == digest_files(pair)
     (copy / "after" / "more").write_text("")
     assert digest_files(copy) != digest_files(pair)
+
+
+def test_the_place_of_a_file_does_not_change_the_digest_of_a_pair(shards: list[Path], tmp_path: Path) -> None:
+    digests = []
+    for number, (name, content) in enumerate((("a/x.json", "d"), ("/b/x.json", "d"), ("a/x.json", "e"))):
+        pair = tmp_path / str(number)
+        shutil.copytree(RunFolder(shards[0]).pair(*FIRST), pair)
+        scenario = {**read_pair_truth(pair).scenario, "sensor": {"profile": name}}
+        write_pair_truth(pair, replace(read_pair_truth(pair), scenario=scenario, files={name: 64 * content}))
+        digests.append(digest_files(pair))
+    assert digests[0] == digests[1] != digests[2]
 
 
 def test_tables_are_written_though_a_pair_of_before_comes_out_otherwise(

@@ -57,15 +57,21 @@ def test_forced_cells_are_forgotten_there_first(tmp_path: Path, runner: Runner, 
     assert outcome.n_done == 4
 
 
-def test_a_first_copy_that_is_cut_short_is_gone_on_with(tmp_path: Path, runner: Runner, plan: Plan) -> None:
+def test_a_first_copy_that_is_cut_short_is_gone_on_with(
+    tmp_path: Path, runner: Runner, plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
     url = f"file://{tmp_path}/far"
     with pytest.raises(KeyboardInterrupt):
         runner.run(tmp_path / "a", plan, shard=PART, mirror=CutShort(url))
     Mirror(url).fetch_all(tmp_path / "c")
     assert len(cells_of(tmp_path / "c")) == 2
+    copied: list[Path] = []
+    copy_cell = Mirror._copy_cell
+    monkeypatch.setattr(Mirror, "_copy_cell", lambda *told: copied.append(told[2]) or copy_cell(*told))
     for name in ("a", "b"):
         _, outcome = runner.run(tmp_path / name, plan, shard=PART, mirror=Mirror(url))
         assert outcome.n_kept == {"a": 2, "b": 4}[name]
+        assert len(copied) == 2  # what was there is not copied again
 
 
 class CutShort(Mirror):
