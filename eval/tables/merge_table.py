@@ -161,8 +161,7 @@ def _counts(group: pd.DataFrame, targets: Targets) -> dict[str, Any]:
         "n_p95_over_half_m": int((accepted & (numbers(group, "merge_error_m_p95") > RIGHT_M)).sum()),
         "is_met": None if asked is None else bool(share >= asked and n_wrong == 0),
         "n_named_degeneracy": int((names_degeneracy(group) & np.asarray(status == "merge_refused")).sum()),
-        **_spread(group[accepted], ERRORS),
-        **_spread(group, TIMES),
+        **_spread(group[accepted], (*ERRORS, *TIMES)),
     }
 
 
