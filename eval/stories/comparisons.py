@@ -84,7 +84,7 @@ def list_sessions(story: Path) -> dict[int, Path]:
     if 1 not in found or len(found) < 2:
         raise InputError(
             f"{story}: expected session-01 and later sessions, as `tunnelcd simulate --sessions 3 ...` writes them; "
-            "recorded sessions may stand there under such names, too"
+            "folders with a session.json of recordings may stand there under such names, too"
         )
     if is_story(story) and (missing := set(range(1, len(read_story(story).sessions) + 1)) - set(found)):
         raise InputError(f"{story}/session-{min(missing):02d}: missing, or damaged: simulate the story again")

@@ -66,7 +66,7 @@ def convert(
 
     DST ends in .osf .pcap .mcap .bag .tum .kitti .laz .las .ply .rrd or .glb, or is a folder: of PCD files, or what
     --to says (ros2, semantic-kitti). A recording and a folder: an OSF or PCAP becomes a session folder, any other
-    format deskewed PLY scans with a TUM trajectory, which all commands take as a session.
+    format deskewed PLY scans with a TUM trajectory, which `detect` takes as a session.
 
     BEFORE AFTER ANSWER become one map with scalar fields, .laz or .ply. A scenario becomes a .glb.
     """
