@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from cdpipe.io.foreign import HowToRead
 
 _FEW_SCANS = 10
+_CELL_M = 0.05
 _ORIGIN = "it is subtracted where a recording becomes a session: convert that again"
 _ANSWER = 3  # inputs of an answer's map: before, after, answer
 
@@ -54,7 +55,10 @@ def convert(
     with_truth: Annotated[
         bool, typer.Option("--with-truth/--without-truth", help="the truth of a simulated session leaves, too")
     ] = False,
-    cell_m: Annotated[float, typer.Option("--cell", min=0.01, help="one point per cell of a map, metres")] = 0.05,
+    cell: Annotated[
+        float | None,
+        typer.Option(min=0.01, help="one point per cell of a map, metres", show_default=str(_CELL_M)),
+    ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, help="seed of a scenario; 0 if left out", show_default=False)
     ] = None,
@@ -79,6 +83,8 @@ def convert(
         raise InputError(f"{out} exists already: name a new file or remove it")
     if out.is_dir() and any(out.iterdir()):
         raise InputError(f"{out}: is not empty: name a new or empty folder for the output")
+    _refuse_cell(cell, sources, out, to)
+    cell_m = _CELL_M if cell is None else cell
     asked = join_world_settings(world, settings)
     hows = how_to_read(min(len(sources), 2), form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin)
     with shown_warnings(), shown_progress(quiet) as progress:
@@ -105,6 +111,16 @@ def convert(
             say(quiet, _export(source, out, to, hows[0], progress, cell_m, with_truth=False))
         else:
             say(quiet, _import(source, out, name, hows[0], progress))
+
+
+def _refuse_cell(cell: float | None, sources: Sequence[Path], out: Path, to: str | None) -> None:
+    """Raise `InputError` if the edge of cells is given and no map is written."""
+    from cdpipe.core.errors import InputError
+    from eval.converting.formats import FORMATS, choose_format
+
+    is_map = len(sources) == _ANSWER or ((out.suffix or to is not None) and FORMATS[choose_format(out, to)].is_map)
+    if cell is not None and not is_map:
+        raise InputError(f"{out}: --cell {cell:g} is of maps (.laz, .las, .ply): leave it out")
 
 
 def _refuse_truth(source: Path, with_truth: bool) -> None:

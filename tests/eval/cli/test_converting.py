@@ -164,6 +164,8 @@ def test_names_and_options_that_do_not_go_together(pair: Path, tmp_path: Path, c
         ((there, tmp_path / "b.osf"), "only a recording of an Ouster, once it is a session folder, and a session of"),
         ((before, pair / "after", there, tmp_path / "m.mcap"), "an answer becomes a map with scalar fields: name"),
         ((there, tmp_path, "--odometry", "kiss-icp"), f"{tmp_path}: is not empty"),
+        ((before, tmp_path / "a.osf", "--cell", "0.1"), "a.osf: --cell 0.1 is of maps (.laz, .las, .ply): leave it"),
+        ((there, tmp_path / "b", "--cell", "0.1"), "b: --cell 0.1 is of maps"),
         ((there, tmp_path / "b", "--with-truth"), "leave --with-truth out"),
         ((there, tmp_path / "new" / "b"), "there.osf: not an OSF file"),
         ((there, tmp_path / "b", "--odometry", "lio"), "--odometry lio: expected kiss-icp"),
