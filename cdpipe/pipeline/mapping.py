@@ -160,6 +160,7 @@ def map_sources(sources: Sequence[ScanSource], config: PipelineConfig, hooks: Ho
         # check both sessions first: mapping may take minutes
         for source, other in (sources, sources[::-1]):
             check_session(source, config.map, other)
+            require_cells_reach(source, config)
         maps = []
         for name, source in zip(("before", "after"), sources, strict=True):
             on_step = partial(_tell_step, hooks, f"map {name}")
@@ -167,9 +168,10 @@ def map_sources(sources: Sequence[ScanSource], config: PipelineConfig, hooks: Ho
             maps.append(build_map(clear_air(CountedScans(source, on_step), config.map), config.map, on_step=on_step))
         return Done((maps[0], maps[1]))
 
-    for source in sources:  # other settings than those of the maps decide as well
+    maps = hooks.run("maps", config, compute).value
+    for source in sources:  # stored maps may be of other settings of later stages
         require_cells_reach(source, config)
-    return hooks.run("maps", config, compute).value
+    return maps
 
 
 def _tell_step(hooks: Hooks, stage: str, step: str, done: int, total: int) -> None:

@@ -137,7 +137,6 @@ def tell_recordings(
             f"{len(paths)} recordings: expected one, which is split, two of one place, or --recording NAME"
         )
     hows = how_to_read(len(paths), form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin)
-    guess_formats(paths, hows)  # which refuses options that no recording has a use for
     told: dict[str, Any] = {"sessions": [str(path) for path in paths], "format": form, "topics": list(topics or ())}
     for name, option, files in (
         ("trajectories", "trajectory", [how.trajectory for how in hows]),

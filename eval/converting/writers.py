@@ -12,7 +12,7 @@ import numpy as np
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import transform
 from cdpipe.core.geometry.voxel import FINEST_CELL_M, max_coordinate_m
-from cdpipe.io.out.scans import Outgoing
+from cdpipe.io.out.scans import START_NS, Outgoing
 from eval.converting.request import Request
 from eval.converting.truth import knows_changes
 
@@ -47,7 +47,7 @@ def write_pcap(request: Request, path: Path) -> None:
 
     session = request.own_session()
     told = {name: value for name, value in session.provenance.items() if name != "sensor_profile"}
-    start_ns = request.outgoing().start_ns
+    start_ns = request.outgoing().start_ns or START_NS  # 0 is no time to the SDK
     write(replace(session, provenance=told), path, path.with_suffix(".json"), start_ns, request.progress.stage)
 
 

@@ -1,7 +1,7 @@
 """The run folder: its layout, its finished cells, and the tables made from them.
 
 provenance.json                               marks a run folder; written first
-copied.json                                   since when a copy at a URL is whole (eval.running.scaling.mirror)
+copied.json                                   time of the newest cell that is at a URL (eval.running.scaling.mirror)
 blind.json                                    opaque names of the pairs (eval.running.export), once exported
 pairs/<world>/<seed>/{before,after,truth}     simulated pairs; a world is a scenario, with what is set over it
 answers/<world>/<seed>/<variant>/             raw answers (cdpipe.io.answer)

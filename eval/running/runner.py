@@ -100,13 +100,10 @@ def run_plan(
         if earlier and not run.stored_provenance():  # an interrupt may leave cells of it
             write_json(run.path / "provenance.json", {**earlier, "finished": None})
         mirror.fetch(run, progress)
-    # sessions that lack are made from their scenarios
-    pairs = schedule_pairs(
-        run, plan, all_cells, force, tools, shard=shard, keep=keep, is_lean=keep != "sessions", progress=progress
-    )
-    n_todo = sum(len(pair.todo) for pair in pairs)
+    schedule = partial(schedule_pairs, run, plan, all_cells, force, tools, shard=shard, keep=keep, progress=progress)
+    pairs = _schedule_leanly(schedule, run, keep)
     chosen = limit_pairs(pairs, limit)
-    n_run = sum(len(pair.todo) for pair in chosen)
+    n_todo, n_run = (sum(len(pair.todo) for pair in some) for some in (pairs, chosen))
     _require_extras(chosen)
     _tell_idle(where, len(chosen), progress)
     made = Made(provenance["git_commit"])
@@ -140,8 +137,8 @@ def run_plan(
         mirror.copy_cells(run)
         mirror.copy_tables(run)
     _settle(run, pairs, keep, progress, tools)
-    n_died = int((results["status"] == "worker_died").sum())
-    return RunOutcome(n_run, len(own_cells) - n_todo, n_todo - n_run, n_died)
+    n_kept, n_died = len(own_cells) - n_todo, int((results["status"] == "worker_died").sum())
+    return RunOutcome(n_run, n_kept, n_todo - n_run, n_died)
 
 
 def _require_either(force: bool, limit: int | None) -> None:
@@ -311,7 +308,7 @@ def _settle(run: RunFolder, pairs: Sequence[Pair], keep: Keep | None, progress: 
         if keep == "sessions":
             if dropped_file(run, pair.name, pair.seed).is_file():
                 remake_pair(run, pair.name, pair.seed, progress, tools)
-            elif not run.pair(pair.name, pair.seed).is_dir():  # removed by hand, or left behind by `merge-runs`
+            elif _lacks_sessions(run, pair) and pair.scenario is not None:
                 with pair_lock(run, pair):
                     opened = PairRun(run, pair, Made(None), progress, tools).open()
                 if isinstance(opened, str):
@@ -319,6 +316,20 @@ def _settle(run: RunFolder, pairs: Sequence[Pair], keep: Keep | None, progress: 
         elif keep == "nothing" or run.pair(pair.name, pair.seed).is_dir():
             with pair_lock(run, pair):
                 drop_pair(run, pair.name, pair.seed, keep)
+
+
+def _schedule_leanly(schedule: Callable[..., list[Pair]], run: RunFolder, keep: Keep | None) -> list[Pair]:
+    """Return the pairs; finished ones come with their scenarios only where sessions are to be made from these."""
+    pairs = schedule(is_lean=True)
+    if keep == "sessions" and any(_lacks_sessions(run, pair) for pair in pairs):
+        return schedule(is_lean=False)
+    return pairs
+
+
+def _lacks_sessions(run: RunFolder, pair: Pair) -> bool:
+    """Tell whether a finished pair was removed by hand, or left behind by `merge-runs`, so that no record is there."""
+    is_there = run.pair(pair.name, pair.seed).is_dir() or dropped_file(run, pair.name, pair.seed).is_file()
+    return not (pair.todo or is_there)
 
 
 def _is_simulated(path: Path, pair: Pair) -> bool:

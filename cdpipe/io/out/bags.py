@@ -4,7 +4,8 @@
     /tf       `lidar` in `odom`, 21 times in each revolution
     /clock    at the same times
 
-Points of a session are not deskewed: `t` and /tf say where each was taken. Those of other recordings are, without `t`.
+Points of a session are not deskewed: `t` and /tf say where each was taken. Those of other recordings, and
+of bare points that `graft` was given, are, without `t`.
 """
 
 # ruff: noqa: PLC0415 - rosbags and mcap are extras, and everybody else must be able to import this

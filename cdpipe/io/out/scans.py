@@ -82,7 +82,7 @@ class Outgoing:
     def start_ns(self) -> int:
         """Time of the recording's clock from which stamps of its scans count."""
         if self.session is not None:
-            return int(self.session.provenance.get("sensor_clock_start_ns") or START_NS)  # 0 is no time to readers
+            return int(self.session.provenance.get("sensor_clock_start_ns", START_NS))
         return round(float(self._posed_clouds().stamps_s[0]) * 1e9)
 
     def span_s(self) -> tuple[float, float]:
@@ -153,7 +153,8 @@ class Outgoing:
         path = scan.odom_T_sensor @ make_pose(Rotation.from_quat(poses[:, 3:]).as_matrix(), poses[:, :3])
         stamps_ns = chunk.column_stamps_ns[row]
         first_ns = int(stamps_ns[0])
-        path_ns, start_ns = stamps_ns[columns] + self.start_ns, first_ns + self.start_ns
+        clock_ns = self.start_ns or START_NS  # 0 is no time to players
+        path_ns, start_ns = stamps_ns[columns] + clock_ns, first_ns + clock_ns
         scalars = self._scalars(scan)
         return OutScan(scan.index, start_ns, path[0], points, scan.stamps_ns - first_ns, scalars, path_ns, path)
 

@@ -29,7 +29,7 @@ from sim.view.viewer import write_html
 _TRUTH_RGB: dict[str, Rgb] = {
     "found": (0, 120, 90), "missed": WRONG_RGB, "unobservable": (150, 150, 150), "not scored": (60, 60, 60),
 }  # fmt: skip
-_REGION_RGB: dict[str, Rgb] = {"true": REGION_RGB, "false": WRONG_RGB}
+_REGION_RGB: dict[str, Rgb] = {"true": REGION_RGB, "false": WRONG_RGB, "not scored": (60, 60, 60)}
 _MAP_POINT_M, _OBJECT_POINT_M = 0.05, 0.09
 _MARGIN_M = 0.15
 
@@ -132,7 +132,7 @@ def _states(truth: GroundTruth, rows: Sequence[Row]) -> list[str]:
 def _regions(report: ChangeReport, rows: Sequence[Row]) -> Iterator[Line]:
     outcomes = {int(number(row, "region")): text(row, "outcome") for row in rows}
     for index in np.flatnonzero(report.regions.is_reported).tolist():
-        word = "false" if outcomes.get(index) == "false" else "true"
+        word = "not scored" if not rows else "false" if outcomes.get(index) == "false" else "true"
         circles = sphere_path(report.regions.centres_map[index], report.regions.radii_m[index])
         yield Line(f"regions/{word}/region {index}", circles, _REGION_RGB[word])
 

@@ -7,7 +7,6 @@ scenario as drawn and the seed, and the digest of all of its files (`eval.runnin
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -95,21 +94,31 @@ def remove_leftovers(run: RunFolder) -> None:
 def digest_files(pair: Path) -> str:
     """Return the digest of all files of a pair that the simulator writes.
 
-    Where its scenario names files, those stand in JSON by their digests: paths depend on the working folder.
+    Where its scenario names files, those stand there by their digests: paths depend on the working folder.
     """
-    files = [path for path in pair.rglob("*") if path.is_file()]
-    own = [path for path in files if _DERIVED.isdisjoint(path.relative_to(pair).parts)]
+    own = _list_files(pair)
     named = read_pair_truth(pair).files if (pair / "truth").is_dir() else {}
     if not named:
         return files_digest(pair, own)
     return digest({path.relative_to(pair).as_posix(): _digest_without_paths(path, named) for path in own})
 
 
+def _list_files(pair: Path) -> list[Path]:
+    files = [path for path in pair.rglob("*") if path.is_file()]
+    return [path for path in files if _DERIVED.isdisjoint(path.relative_to(pair).parts)]
+
+
 def _digest_without_paths(file: Path, named: Mapping[str, str]) -> str:
-    content = file.read_bytes()
-    for path, found in named.items() if file.suffix == ".json" else ():
-        content = content.replace(json.dumps(path).encode(), json.dumps(found).encode())
-    return hashlib.sha256(content).hexdigest()
+    if file.name not in ("changes.json", "session.json"):
+        with file.open("rb") as content:
+            return hashlib.file_digest(content, "sha256").hexdigest()
+    document = read_json(file, _EXPECTED)
+    if isinstance(document.get("scenario"), dict):
+        document |= {"scenario": without_paths(document["scenario"], named), "files": sorted(named.values())}
+    told = document.get("provenance")
+    if isinstance(told, dict) and (profile := told.get("sensor_profile")) in named:
+        document["provenance"] = {**told, "sensor_profile": named[str(profile)]}
+    return digest(document)
 
 
 def dropped_file(run: RunFolder, world: str, seed: int) -> Path:
@@ -133,7 +142,8 @@ def require_same_bytes(record: Dropped, pair: Path) -> None:
         InputError: It is another one.
     """
     found = digest_files(pair)
-    if found != record.digest:
+    # records of before 0.2.0 are of files with their paths
+    if record.digest not in (found, files_digest(pair, _list_files(pair))):
         raise InputError(
             f"{record.world} {record.seed}: made again, and its files differ from those that its answers are of "
             f"(digest {found}, not {record.digest}): use the versions that provenance.json names, or run the plan "

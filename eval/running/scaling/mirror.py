@@ -46,6 +46,7 @@ class Mirror:
             raise InputError("a URL with a password would stand in provenance.json: leave it to fsspec's configuration")
         self.url = url
         self._fs, self._root = _open(url)
+        self._fetched: dict[str, int] = {}  # cells that were taken from there, and when they were written here
 
     def provenance(self) -> dict[str, Any]:
         """Return the provenance of the run there; {} where there is none.
@@ -75,6 +76,7 @@ class Mirror:
         """
         names = [name for name in self._list("cells") if _CELL.fullmatch(name) and not (run.path / name).exists()]
         self._get(run.path, names, progress or Silent())
+        self._fetched |= {name: (run.path / name).stat().st_mtime_ns for name in names}
 
     def fetch_all(self, folder: Path, progress: RunProgress | None = None) -> None:
         """Take provenance, cells and answers into an empty folder.
@@ -123,23 +125,30 @@ class Mirror:
             InputError: The place cannot be written.
         """
         self._put(run, [run.path / "provenance.json"])
-        stored, copied_ns = set(self._list("cells")), read_json(run.path / _RECORD).get(self.url)
+        stored, copied_ns = set(self._list("cells")), self._copied_ns(run)
         cells = sorted(run.path.glob("cells/*/*/*.json"))
         for cell in cells:
-            is_newer = isinstance(copied_ns, int) and cell.stat().st_mtime_ns > copied_ns
-            if is_newer or _relative(run, cell) not in stored:
+            name, written_ns = _relative(run, cell), cell.stat().st_mtime_ns
+            if name not in stored or (written_ns > copied_ns and self._fetched.get(name) != written_ns):
                 self._copy_cell(run, cell)
         if cells:
             self._note_copied(run, cells)
 
     def _note_copied(self, run: RunFolder, cells: Iterable[Path]) -> None:
         """Note when the newest cell was written that is there; one that is newer is copied again."""
-        noted = read_json(run.path / _RECORD)
         times_ns = [cell.stat().st_mtime_ns for cell in cells if cell.exists()]
-        earlier = noted.get(self.url)
-        write_json(
-            run.path / _RECORD, {**noted, self.url: max([earlier if isinstance(earlier, int) else 0, *times_ns])}
-        )
+        noted = {**read_json(run.path / _RECORD), self._key: max([self._copied_ns(run), *times_ns])}
+        write_json(run.path / _RECORD, noted)
+
+    def _copied_ns(self, run: RunFolder) -> int:
+        noted = read_json(run.path / _RECORD).get(self._key)
+        return noted if isinstance(noted, int) else 0
+
+    @property
+    def _key(self) -> str:
+        """Name of the place, however its URL is written."""
+        protocol = self._fs.protocol
+        return f"{protocol if isinstance(protocol, str) else protocol[0]}:{self._root}"
 
     def _copy_cell(self, run: RunFolder, cell: Path) -> None:
         answer = run.path / "answers" / cell.relative_to(run.path / "cells").with_suffix("")

@@ -37,6 +37,7 @@ from scenarios.library import load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import Scenario
 from sim.session.simulate import simulate_pair
+from sim.session.truth import read_pair_truth
 
 _FAMILIES = ("narrow", "wide", "network")
 _SEEDS = "10300:10304"  # of the validation seeds
@@ -83,7 +84,7 @@ def measure(
         document = read_json(path)
         if document.get("key") != key or not _are_rows(document.get("rows")):
             pair = out / "pairs" / path.stem
-            if document.get("key") != key:  # what lies there is of another world, or cut short
+            if not _is_made_of(pair, scenario, seed):  # of another world, or cut short
                 remove(pair)
             try:
                 if not pair.exists():
@@ -100,6 +101,15 @@ def measure(
         rows += document["rows"]
     progress.cells("done", len(todo), len(todo))
     return pd.DataFrame(rows)
+
+
+def _is_made_of(pair: Path, scenario: Scenario, seed: int) -> bool:
+    try:
+        truth = read_pair_truth(pair)
+    except InputError:
+        return False
+    is_same = digest(truth.scenario) == digest(scenario.model_dump(mode="json"))
+    return is_same and truth.seed == seed and truth.files == file_digests(scenario)
 
 
 def _are_rows(rows: Any) -> bool:

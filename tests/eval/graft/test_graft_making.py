@@ -236,6 +236,9 @@ def test_scans_of_bare_points_leave_as_they_are_and_not_as_a_sweep(simulated: Pa
 
 def test_a_clock_that_begins_at_0_tells_no_time(simulated: Path) -> None:
     session = read_session(simulated / "before")
+    first_ns = int(session.chunk(0).column_stamps_ns[0, 0])
     for start_ns, told in ((0, START_NS), (7, 7), (None, START_NS)):
         given = {} if start_ns is None else {"sensor_clock_start_ns": start_ns}
-        assert Outgoing(RecordedScans(replace(session, provenance=given))).start_ns == told
+        outgoing = Outgoing(RecordedScans(replace(session, provenance=given)))
+        assert next(outgoing.sweeps(lambda *_: None)).stamp_ns == first_ns + told
+        assert outgoing.start_ns == (told if start_ns is None else start_ns)

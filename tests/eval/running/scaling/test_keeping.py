@@ -16,10 +16,11 @@ from eval.report.page import write_page
 from eval.running.pair_run import Tools
 from eval.running.rescoring import rescore
 from eval.running.runfolder import RunFolder
-from eval.running.scaling.keeping import Keep, digest_files, list_dropped
+from eval.running.scaling.keeping import Dropped, Keep, digest_files, list_dropped, require_same_bytes
 from eval.running.scaling.merging import merge_runs
 from eval.running.scaling.remaking import remade_below, remade_when_asked, remake_pair
 from eval.running.scaling.shards import Shard
+from eval.running.stages.stage_cache import files_digest
 from scenarios.schema import Scenario
 from sim.session.truth import read_pair_truth, write_pair_truth
 from tests.eval.running.scaling.conftest import VARIANT, WORLDS, Runner, load_small
@@ -134,6 +135,14 @@ def test_the_place_of_a_file_does_not_change_the_digest_of_a_pair(shards: list[P
         write_pair_truth(pair, replace(read_pair_truth(pair), scenario=scenario, files={name: 64 * content}))
         digests.append(digest_files(pair))
     assert digests[0] == digests[1] != digests[2]
+    # a record of before is of the files with their paths
+    pair = tmp_path / "0"
+    own = [path for path in pair.rglob("*") if path.is_file() and path.name != "scoring_points.npz"]
+    old = files_digest(pair, own)
+    record = Dropped(world="w", seed=1, scenario={}, files={}, digest=old, n_bytes=1)
+    require_same_bytes(record, pair)
+    with pytest.raises(InputError, match="its files differ"):
+        require_same_bytes(record.model_copy(update={"digest": "0" * 16}), pair)
 
 
 def test_tables_are_written_though_a_pair_of_before_comes_out_otherwise(

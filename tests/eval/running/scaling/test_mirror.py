@@ -94,6 +94,14 @@ def test_cells_that_were_written_without_the_copy_are_copied_again(
         runner.run(tmp_path / "a", plan, shard=PART, mirror=Mirror(url))
         assert copied == [cells[1]]
     assert (tmp_path / "far" / cells_of(run.path)[1]).read_text() == cells[1].read_text()
+    # however the URL is written; without a record of what was copied all is
+    for is_noted in (True, False):
+        cells[2].write_text(cells[2].read_text() + " ")
+        copied.clear()
+        if not is_noted:
+            (run.path / "copied.json").unlink()
+        runner.run(tmp_path / "a", plan, shard=PART, mirror=Mirror(str(tmp_path / "far")))
+        assert copied == ([cells[2]] if is_noted else cells)
 
 
 class Stopped(Mirror):
