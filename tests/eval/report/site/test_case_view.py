@@ -82,7 +82,13 @@ def test_both_maps_and_all_changes_are_in_one_frame(tiny_pair: Path, tiny_merge:
             cells = cells @ tiny_merge[:3, :3].T + tiny_merge[:3, 3]
         np.testing.assert_allclose(line.points.min(axis=0), cells.min(axis=0) - 0.15, atol=1e-9)
     # one region is reported, the other is not
-    assert [line.name for line in view.lines if line.name.startswith("regions/")] == ["regions/true/region 0"]
+    assert [line.name for line in view.lines if line.name.startswith("regions/")] == ["regions/not scored/region 0"]
+    for outcome, word in (("true", "true"), ("false", "false"), ("duplicate", "true")):
+        scored = {**rows, "regions": [{"region": 0, "outcome": outcome}]}
+        view = case_view("here", (before, after), truth, report(tiny_merge), scored)
+        assert [line.name for line in view.lines if line.name.startswith("regions/")] == [f"regions/{word}/region 0"]
+    unscored = case_view("here", (before, after), truth, report(tiny_merge), {})
+    assert {line.name.split("/")[1] for line in unscored.lines if line.name.startswith("truth/")} == {"not scored"}
     assert "missed" in next(label.text for label in view.labels if np.array_equal(label.position, view.target))
 
 
