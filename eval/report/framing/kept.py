@@ -29,6 +29,8 @@ _LARGEST_BYTES, _MOST_PIXELS = 64_000_000, 40_000_000
 _ADDRESS = re.compile(r"data:image/(png|webp);base64,([A-Za-z0-9+/]+=*)")
 _FROM_EARLIER = "From an earlier page of this run, in the colours of then."
 _KEPT = "Sessions and answers are not beside this page: pictures and tables made of them are those of an earlier page."
+# what that sentence says of each pair
+_COVERED = re.compile("The (stored answer of|maps for pictures|aligned maps of|truth of) ")
 _LONE = {"settings": "settings", "table1": "paper", "table2": "paper"}  # the others need results.csv alone
 _TABLED = ("regions", "objects", "surface", "merge")
 
@@ -87,7 +89,7 @@ def keep(content: Mapping[str, Any], kept: KeptPage) -> dict[str, Any]:
         for key, pictures in kept.pictures.items() if key not in taken
     }  # fmt: skip
     if kept.tables:
-        found["missing"] = [*found["missing"], _KEPT]
+        found["missing"] = [*(line for line in found["missing"] if not _COVERED.match(line)), _KEPT]
     return found
 
 

@@ -99,8 +99,9 @@ def read_run(run: Path) -> RunData:
     absent = [name for name in REQUIRED if name not in results[0]]
     if absent:
         raise InputError(f"{path}: column {', '.join(absent)} is missing: expected a table written by `tunnelcd run`")
-    require_cases(path, pd.DataFrame(results))
-    results = tuple(records(without_costs_of_failures(pd.DataFrame(results))))
+    frame = pd.DataFrame(results)
+    require_cases(path, frame)
+    results = tuple(records(without_costs_of_failures(frame)))
     missing = []
     items: dict[str, tuple[Row, ...]] = {"changes": (), "regions": ()}
     for name in items:

@@ -142,7 +142,7 @@ def require_same_bytes(record: Dropped, pair: Path) -> None:
         InputError: It is another one.
     """
     found = digest_files(pair)
-    # records of before 0.2.0 are of files with their paths
+    # older records are of files with their paths
     if record.digest not in (found, files_digest(pair, _list_files(pair))):
         raise InputError(
             f"{record.world} {record.seed}: made again, and its files differ from those that its answers are of "

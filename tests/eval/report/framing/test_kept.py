@@ -35,7 +35,9 @@ def test_pictures_and_tables_of_answers_survive_the_loss_of_what_made_them(run: 
     kept = write_page(run, "none", keeps=True)
     assert sorted(PICTURE.findall(kept.read_text())) == sorted(PICTURE.findall(before))
     assert tables_of(kept) == tables
-    assert "those of an earlier page" in kept.read_text().partition('id="missing"')[2]
+    missing = kept.read_text().partition('id="missing"')[2].partition("</ul>")[0]
+    assert "those of an earlier page" in missing and "regions.csv is not in the run folder" in missing
+    assert "cannot be read" not in missing and "maps" not in missing  # the sentence above says it of all pairs
     again = write_page(run, "none", keeps=True)
     assert sorted(PICTURE.findall(again.read_text())) == sorted(PICTURE.findall(before))
     assert tables_of(again) == tables
