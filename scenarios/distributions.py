@@ -19,6 +19,7 @@ from cdpipe.core.files import Key
 from cdpipe.core.geometry import stream
 
 NAMES = ("uniform", "normal", "integers", "choice")
+_MOST_COPIES = 10_000
 _WHOLE = 2**63  # whole numbers are drawn from this far below 0 to this far above, which is excluded
 
 
@@ -212,10 +213,10 @@ _FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
 def _repeat_rule(repeat: Any) -> str:
     if isinstance(repeat, dict) and len(repeat) == 1 and not _distribution_rule(repeat):
         ((name, argument),) = repeat.items()
-        numbers = argument if name == "choice" else argument[:1] if name == "integers" else [None]
-        return next((rule for rule in map(_repeat_rule, numbers) if rule), "")
-    is_count = isinstance(repeat, int) and not isinstance(repeat, bool) and repeat >= 0
-    return "" if is_count else "expected a whole number >= 0, or integers or choice of such"
+        bounds = [argument[0], argument[1] - 1] if name == "integers" else [None]
+        return next((rule for rule in map(_repeat_rule, argument if name == "choice" else bounds) if rule), "")
+    is_count = isinstance(repeat, int) and not isinstance(repeat, bool) and 0 <= repeat <= _MOST_COPIES
+    return "" if is_count else f"expected a whole number from 0 to {_MOST_COPIES}, or integers or choice of such"
 
 
 def _chance_rule(chance: Any) -> str:

@@ -15,6 +15,7 @@ from eval.plans.variants import ORACLE_MERGE
 from eval.plans.worlds import PairKind
 
 RATE_COLUMN, PROPOSED = "recall_at_", "_proposed"
+SURFACE_COLUMN = "surface_"
 
 
 class Target(Settings):
@@ -26,11 +27,13 @@ class Target(Settings):
         domain: In or out of the training distribution; all pairs where neither this nor a site is set.
         site: Over the pairs with changes of the families whose name ends so, e.g. site1; the column is of results.csv.
         sensor: Over the pairs with this sensor, all domains together; the column is of results.csv.
+        odometry: Over the pairs with this odometry, where the plan's figures are of another; the column is of a table.
         less_sensor: A sensor whose value on the same pairs (family and seed) is subtracted; with `sensor`.
         at_least: The lower bound.
         at_most: The upper bound; exactly one of the two is set.
         method: Of which method, where it is not the one that the targets are about.
-        less: A rival whose value is subtracted first; for the columns `recall_at_...` and `recall_at_..._proposed`.
+        less: A rival whose value is subtracted first; for `recall_at_...` and `recall_at_..._proposed` of one domain,
+            and for the columns `surface_...` of surface_table.csv.
         least_km: No verdict where the unchanged pairs are shorter than this together.
     """
 
@@ -39,6 +42,7 @@ class Target(Settings):
     domain: Literal["in", "out"] | None = None
     site: str = ""
     sensor: str = ""
+    odometry: str = ""
     less_sensor: str = ""
     at_least: float | None = None
     at_most: float | None = None
@@ -54,8 +58,11 @@ class Target(Settings):
             raise ValueError("expected one of domain, site and sensor")
         if self.less_sensor and not self.sensor:
             raise ValueError("less_sensor: for a target with a sensor")
-        if self.less and not (self.domain and self.column.startswith(RATE_COLUMN)):
-            raise ValueError(f"less: for a column {RATE_COLUMN}... of one domain")
+        is_rate = self.domain is not None and self.column.startswith(RATE_COLUMN)
+        if self.less and not (is_rate or self.column.startswith(SURFACE_COLUMN)):
+            raise ValueError(f"less: for a column {RATE_COLUMN}... of one domain, or {SURFACE_COLUMN}...")
+        if self.odometry and (self.site or self.sensor or (self.less and is_rate)):
+            raise ValueError("odometry: for a column of a table, without site, sensor or a rate of a rival")
         return self
 
     @property

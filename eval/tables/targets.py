@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
 from eval.core.statistics import interval_over_tunnels, mean_with_interval, median
-from eval.plans.targets import PROPOSED, RATE_COLUMN, Target, Targets
+from eval.plans.targets import PROPOSED, RATE_COLUMN, SURFACE_COLUMN, Target, Targets
 from eval.tables.conditions import ANY, by_condition, odometry_of, of_condition
 from eval.tables.regions.curves import RankedPairs, recall_difference
 from eval.tables.rows import numbers, records, texts, tunnels_of
@@ -50,7 +51,8 @@ def judged_targets(
         targets: What the plan asks for.
         subject: Of which part of it.
         table: regions_table, objects_table or surface_table.
-        results: Rows as in results.csv; judged are those of the odometry and the sensor that the plan's figures are of.
+        results: Rows as in results.csv; judged are those of the odometry and the sensor that the plan's figures are of,
+            but for a target that names another odometry.
         ranked: Candidates and changes of each domain and variant, for targets against a rival; as reported (False), and
             as proposed (True).
         is_whole: Whether all that was planned is in the tables; otherwise nothing is said to be met or not.
@@ -62,18 +64,21 @@ def judged_targets(
     """
     rows = []
     main, is_its = by_condition(results, targets)[0]
-    table, own = of_condition(table, main), results[is_its]
+    own = results[is_its]
     for target in getattr(targets, subject):
         variant = target.method or targets.method
+        figures = of_condition(table, replace(main, odometry=target.odometry or main.odometry))
         found: dict[str, Any] | None
         if target.site:
             found = _on_site(target, variant, own)
         elif target.sensor:
             found = _with_sensor(target, variant, results, main.odometry)
+        elif target.less and target.column.startswith(SURFACE_COLUMN):
+            found = _less_rival(target, variant, figures)
         elif target.less:
             found = _against(target, variant, ranked or {})
         else:
-            found = _of_table(target, variant, table)
+            found = _of_table(target, variant, figures)
         if found is None:
             continue
         is_long, is_missed = found.pop("km", math.inf) >= target.least_km, found.pop("is_missed", False)
@@ -121,6 +126,14 @@ def _against(
     rate = float(target.column.removeprefix(RATE_COLUMN).removesuffix(PROPOSED))
     difference, low, high = recall_difference(theirs, ours, rate)
     return {"domain": target.domain, "value": difference, "low": low, "high": high, "n": len(ours.pairs)}
+
+
+def _less_rival(target: Target, variant: str, table: pd.DataFrame) -> dict[str, Any] | None:
+    """Return the figure of a row of the table less that of a rival; they share pairs, so no interval stands for it."""
+    ours, theirs = (_of_table(target, name, table) for name in (variant, target.less))
+    if ours is None or theirs is None:
+        return None
+    return {**ours, "value": ours["value"] - theirs["value"], "low": math.nan, "high": math.nan}
 
 
 def _on_site(target: Target, variant: str, results: pd.DataFrame) -> dict[str, Any]:

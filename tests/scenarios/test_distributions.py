@@ -151,6 +151,7 @@ def test_every_malformed_distribution_is_told_at_once() -> None:
         "j": {"uniform": [float("nan"), 1]},
         "l": {"uniform": [-1e308, 1e308]},
         "k": [{"repeat": -1}, {"repeat": {"uniform": [1, 2]}}, {"chance": 2}, {"one_of": []}],
+        "m": [{"repeat": 10_001}, {"repeat": {"integers": [0, 10_002]}}, {"repeat": {"integers": [0, 10_001]}}],
         "fine": [{"repeat": {"choice": [1, {"integers": [0, 2]}]}, "chance": 0.5}],
     }
     lines = {join_key(key): rule for key, rule in find_malformed(tree).items()}
@@ -165,6 +166,8 @@ def test_every_malformed_distribution_is_told_at_once() -> None:
         "k.1.repeat",
         "k.2.chance",
         "k.3.one_of",
+        "m.0.repeat",
+        "m.1.repeat",
     ]
     assert "uniform: [a, b]" in lines["a"]
     assert 'did you mean "uniform"?' in lines["h"]

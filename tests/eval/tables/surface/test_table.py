@@ -160,3 +160,27 @@ def test_a_field_of_zeros_meets_no_bound_on_errors() -> None:
         windows = pd.DataFrame([*null_windows(), *(window(0.04, answered_m, seed=seed) for seed in (1, 2))])
         (row,) = surface_tables(results, windows, targets)["surface_targets"].to_dict("records")
         assert row["is_met"] is is_met
+
+
+def test_a_bound_may_be_on_another_odometry_and_on_what_is_less_than_a_rival() -> None:
+    errors = {("ours", "kiss-icp"): 0.004, ("ours", "drift"): 0.002, ("c2c", "kiss-icp"): 0.01, ("c2c", "drift"): 0.001}
+    results = pd.DataFrame(
+        [
+            case(seed, variant=variant, surface_error_median_m=error, odometry_before=name, odometry_after=name)
+            for (variant, name), error in errors.items() for seed in (1, 2)
+        ]
+    )  # fmt: skip
+    column = {"column": "surface_error_median_m", "at_most": 0}
+    bounds = (
+        {**column, "name": "less", "less": "c2c"},
+        {**column, "name": "drift", "odometry": "drift"},
+        {**column, "name": "both", "odometry": "drift", "less": "c2c"},
+        {**column, "name": "no rival", "less": "c2m"},
+    )
+    windows = [*null_windows(), *(window(0.04, 0.03, seed=seed) for seed in (1, 2))]
+    windows = [{**row, "variant": variant} for row in windows for variant in ("ours", "c2c")]
+    targets = Targets(method="ours", odometry="kiss-icp", surface=bounds)
+    judged = surface_tables(results, pd.DataFrame(windows), targets)["surface_targets"]
+    assert list(judged["target"]) == ["less", "drift", "both"]
+    assert list(judged["value"]) == pytest.approx([-0.006, 0.002, 0.001])
+    assert list(judged["is_met"]) == [True, False, False]
