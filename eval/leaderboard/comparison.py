@@ -23,15 +23,16 @@ from eval.report.comparing.differences import NOT_JUDGED, paired_differences, ve
 from eval.report.render import write_file
 from eval.running.results.run_data import RunData
 from eval.running.results.sides import find_other_worlds
+from eval.running.results.values import text
 from eval.tables.conditions import odometry_of
-from eval.tables.rows import PAIR, is_told_the_truth, numbers, stated, tunnels_of
+from eval.tables.rows import PAIR, is_told_the_truth, numbers, stated, texts, tunnels_of
 
-FIGURES = ("region_recall", "false_regions_per_100m", "object_iou_point", "object_f1_50", "t_total_s")
-HEADINGS = ("recall", "false/100m", "IoU", "F1 at 0.5", "time [s]")
+FIGURES = ("region_recall", "false_regions_per_100m", "is_alarm", "object_iou_point", "object_f1_50", "t_total_s")
+HEADINGS = dict(zip(FIGURES, ("recall", "false/100m", "alarms", "IoU", "F1 at 0.5", "time [s]"), strict=True))
 SHOWN = {column.key: column for column in COMPARED}
 _MAIN_REFERENCE = "tunnelcd"
 _NAME_WIDTH, _PAIRS_WIDTH = 18, 8
-_WIDTHS = (10, 11, 10, 10, 12)
+_WIDTHS = (10, 11, 10, 10, 12)  # of five figures
 
 Pairs = Mapping[tuple[str, int], Mapping[str, Any]]
 
@@ -103,16 +104,21 @@ def write_tables_of(found: Comparison, folder: Path) -> None:
 
 
 def list_lines(found: Comparison) -> list[str]:
-    """Return the table and what was found as lines of at most 80 characters: below each mean stands its interval."""
-    lines, part = [_line("method", "pairs", HEADINGS)], ""
+    """Return the table and what was found as lines of at most 80 characters: below each mean stands its interval.
+
+    Alarms stand in the place of times where there are pairs without changes.
+    """
+    left_out = "is_alarm" if found.table["is_alarm"].isna().all() else "t_total_s"
+    shown = [key for key in FIGURES if key != left_out]
+    lines, part = [_line("method", "pairs", [HEADINGS[key] for key in shown])], ""
     for row in found.table.to_dict("records"):
         if row["part"] != part:
             part = str(row["part"])
             lines.append(f"{part}:")
         name = str(row["method"])
         name = name if len(name) < _NAME_WIDTH else f"{name[: _NAME_WIDTH - 2]}\u2026"
-        spans = [show_span(key, row[f"{key}_low"], row[f"{key}_high"]) for key in FIGURES]
-        values = [show_figure(key, row[key]) for key in FIGURES]
+        spans = [show_span(key, row[f"{key}_low"], row[f"{key}_high"]) for key in shown]
+        values = [show_figure(key, row[key]) for key in shown]
         lines.append(_line(name, f"{row['n_answered']}/{row['n_pairs']}", values))
         lines += [_line("", "", spans).rstrip()] if any(spans) else []
     return [*lines, *_list_differences(found)]
@@ -134,10 +140,9 @@ def _list_differences(found: Comparison) -> Iterator[str]:
         if row["part"] != part:
             part = str(row["part"])
             yield f" {part}:"
-        heading = HEADINGS[FIGURES.index(row["metric"])]
         low, difference, high = (show_figure(row["metric"], row[name]) for name in ("low", "difference", "high"))
         span = "" if math.isnan(row["low"]) else f" ({low} to {high})"
-        yield f"  {heading:<11}{difference:>7}{span}, {row['verdict']}"
+        yield f"  {HEADINGS[row['metric']]:<11}{difference:>7}{span}, {row['verdict']}"
 
 
 def take_figures(results: pd.DataFrame) -> pd.DataFrame:
@@ -243,9 +248,17 @@ def _notes(
 
 
 def note_other_worlds(results: pd.DataFrame, references: Sequence[RunData]) -> Iterator[str]:
-    """Yield one sentence for each run whose pairs are other worlds than those of the same name that were answered."""
+    """Yield sentences about runs whose pairs are, or may be, others than those of the same name that were answered."""
+    pairs, commits = set(zip(results["scenario"], results["seed"], strict=True)), set(texts(results, "commit"))
     for data in references:
-        if data.results and (worlds := find_other_worlds(results, pd.DataFrame(list(data.results)))):
+        rows = [row for row in data.results if (row["scenario"], row["seed"]) in pairs]
+        if others := sorted({text(row, "commit")[:7] for row in rows if text(row, "commit") not in commits}):
+            told = ", ".join(other or "an unknown one" for other in others)
+            yield (
+                f"rows of {data.folder.path.name} are of commit {told}: sessions differ where the simulator has "
+                "changed since"
+            )
+        if rows and (worlds := find_other_worlds(results, pd.DataFrame(rows))):
             where = f"{count_pairs(len(worlds))} of {data.folder.path.name}"
             yield f"{where} hold other changes or another drive ({worlds[0]})"
 
@@ -258,7 +271,7 @@ def _why_none(data: RunData, own: pd.DataFrame) -> str:
     if version == version_name():
         seeds += ": evaluate with --split sealed"
     elif version != split:
-        seeds += f", and this is {version_name()}: evaluate with that version and --split sealed"
+        seeds += f": evaluate with --split sealed:{version.rpartition(' ')[2]}"
     return f"{data.folder.path} holds none of these {len(own)} pairs; its pairs are {seeds}"
 
 

@@ -91,8 +91,8 @@ def write_leaderboard(files: Sequence[CheckedFile], out: Path, reference: Path |
          "version": each.content.versions.get("tunnelcd", "")}
         for each, n in zip(files, checked, strict=True)
     ]  # fmt: skip
-    columns = list(zip(HEADINGS, (SHOWN[key] for key in FIGURES), strict=True))
-    headings = ("method", "merge", "pairs", *HEADINGS)
+    columns = [(heading, SHOWN[key]) for key, heading in HEADINGS.items()]
+    headings = ("method", "merge", "pairs", *HEADINGS.values())
     content = {"boards": boards, "headings": headings, "files": told, "columns": columns}
     with made_parents(out):
         write_file(out, render_page("leaderboard.html", content))
@@ -177,7 +177,10 @@ def _notes(
 
 
 def _place(row: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return what sorts the best first: F1, which false objects lower, then the others; alarms where all are NaN."""
+    """Return what sorts the best first: F1, which false objects lower, then the others.
+
+    Where nothing changed all of these are NaN: alarms count, which pairs that were refused are too.
+    """
     high = (row["object_f1_50"], row["object_iou_point"], row["region_recall"])
-    order = (*(-value for value in high), row["false_regions_per_100m"])
+    order = (*(-value for value in high), row["is_alarm"], row["false_regions_per_100m"])
     return tuple(math.inf if math.isnan(value) else value for value in order)

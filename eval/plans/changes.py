@@ -13,7 +13,7 @@ from cdpipe.core.yamlfile import Document, validate
 from eval.plans.parts import get_key, has_effect_on_true_regions, require_valid_setting, require_valid_settings
 from eval.plans.plan import Plan
 from eval.plans.seeds import parse_seeds
-from eval.plans.splits import SplitName, seal_seeds, version_name
+from eval.plans.splits import seal_seeds, sealed_by
 from eval.plans.worlds import get_group
 
 
@@ -21,7 +21,7 @@ def change_plan(
     plan: Plan,
     *,
     seeds: str | None = None,
-    split: SplitName = "dev",
+    split: str = "dev",
     presets: Sequence[str] = (),
     settings: Sequence[str] = (),
     grid: Sequence[str] = (),
@@ -31,7 +31,8 @@ def change_plan(
     Args:
         plan: The plan.
         seeds: "A:B", replaces the plan's seeds.
-        split: `sealed` replaces each seed of the plan, a seed of `dev`, by a sealed one.
+        split: `sealed` replaces each seed of the plan, a seed of `dev`, by a sealed one of this version;
+            `sealed:0.1.0` by one of that version.
         presets: Names or files, replace the plan's variants, its own grids, thresholds and targets. A variant that is
             a preset alone keeps what the plan sets for it by scenario.
         settings: `key=value`, written over every variant and every grid point.
@@ -47,12 +48,11 @@ def change_plan(
     document = plan.model_dump(mode="json")
     if seeds is not None:
         document["seeds"] = parse_seeds(seeds)
-    if split == "sealed":
-        version = version_name()
+    if version := sealed_by(split):
         try:
             document |= {"seeds": seal_seeds(document["seeds"], version), "split": f"sealed by {version}"}
         except ValueError as error:
-            raise InputError(f"--split sealed: plan {plan.name}: {error}") from error
+            raise InputError(f"--split {split}: plan {plan.name}: {error}") from error
     if presets:
         document |= {"variants": [_find_variant(document["variants"], name) for name in presets]}
         document |= {"grid": [], "targets": {}, "thresholds": {}}

@@ -7,16 +7,19 @@ name of the version that is released. Each seed of `dev` has one, so plans that 
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field
 
+from cdpipe.core.errors import InputError
+from cdpipe.core.names import visible
 from cdpipe.core.yamlfile import Settings, read_yaml, validate
 
-SplitName = Literal["dev", "sealed"]
+_SEALED = re.compile(r"sealed(?::(\d{1,9}(?:\.\d{1,9}){0,3}))?")
 
 
 class Split(Settings):
@@ -42,6 +45,30 @@ def load_splits() -> Splits:
 def version_name() -> str:
     """Return the name of the version that runs, from which sealed seeds are drawn."""
     return f"tunnelcd {metadata.version('tunnelcd')}"
+
+
+def sealed_by(split: str) -> str:
+    """Return the name of the version that a split's seeds are drawn from, "" for `dev`.
+
+    Args:
+        split: `dev`, `sealed` for the version that runs, or `sealed:0.1.0` for an earlier one.
+
+    Raises:
+        InputError: It is none of these, or a version that is not out yet: its seeds are for nobody to see.
+    """
+    if split == "dev":
+        return ""
+    found, running = _SEALED.fullmatch(split), version_name()
+    if found is None:
+        raise InputError(f"--split {visible(split)}: expected dev, sealed or, for an earlier version, sealed:0.1.0")
+    version = f"tunnelcd {found[1]}" if found[1] else running
+    if _numbers_of(version) > _numbers_of(running):
+        raise InputError(f"--split {split}: this is {running}: expected it or an earlier one")
+    return version
+
+
+def _numbers_of(version: str) -> list[int]:
+    return [int(part) for part in re.findall(r"\d+", version)]
 
 
 def seal_seeds(seeds: Sequence[int], version: str) -> tuple[int, ...]:

@@ -62,8 +62,11 @@ def evaluate(
     ] = "own",
     seeds: Annotated[str | None, typer.Option(metavar="A:B", help="replaces the plan's seeds; B excluded")] = None,
     split: Annotated[
-        Literal["dev", "sealed"],
-        typer.Option(help="`sealed`: seeds of this version, as some committed results have"),
+        str,
+        typer.Option(
+            metavar="dev|sealed",
+            help="sealed: other seeds, drawn from this version's name; sealed:0.1.0: from that one's",
+        ),
     ] = "dev",
     time_limit: Annotated[float, typer.Option(min=0.1, max=86_400, help="seconds for one pair, wall clock")] = 600.0,
     reference: Annotated[

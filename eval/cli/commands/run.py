@@ -52,8 +52,11 @@ def run_command(
     out: RunOut,
     seeds: Annotated[str | None, typer.Option(metavar="A:B", help="replaces the plan's seeds; B excluded")] = None,
     split: Annotated[
-        Literal["dev", "sealed"],
-        typer.Option(help="`sealed`: other seeds, drawn from the name of this version"),
+        str,
+        typer.Option(
+            metavar="dev|sealed",
+            help="sealed: other seeds, drawn from this version's name; sealed:0.1.0: from that one's",
+        ),
     ] = "dev",
     preset: Annotated[
         list[str] | None,

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 from cdpipe.core.errors import InputError
+from eval.cli.printed_results import print_summary
 from eval.core.terminal.exits import input_errors
 from eval.core.terminal.printing import LINE, print_fitted, print_row, print_table, say
 from eval.core.terminal.progress import Bars, Lines
@@ -99,3 +100,18 @@ def test_what_a_file_holds(tmp_path: Path, command: Command, text: str) -> None:
     code, out, err = command("check", path)
     assert code == 2 and is_harmless(out + err)
     assert all(line.startswith(f"error: {path}") for line in err.splitlines()), err
+
+
+def test_f1_stands_beside_iou_in_80_columns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    columns = [
+        "region_recall", "region_precision", "region_recall_at_k", "n_regions", "object_iou_point", "object_f1_50",
+        "merge_error_m", "t_total_s",
+    ]  # fmt: skip
+    row = {"scenario": "unchanged/narrow", "seed": 20001, "status": "ok", **dict.fromkeys(columns, 0.123456)}
+    names = ("tunnelcd[extract.voxel_m=0.3]", "sphere-difference")
+    pd.DataFrame([{**row, "variant": name} for name in names]).to_csv(tmp_path / "results.csv", index=False)
+    print_summary(tmp_path)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= LINE
+    heading = next(line for line in lines if "IoU" in line)
+    assert "F1@50" in heading and "precision" not in heading

@@ -92,7 +92,7 @@ def test_the_table_fits_80_columns(tmp_path: Path) -> None:
 
 def test_without_the_same_pairs_the_reason_is_told(tmp_path: Path) -> None:
     frame = table()
-    for version, advice in ((version_name(), "sealed: evaluate with --split"), ("tunnelcd 0.0.1", "with that version")):
+    for version, advice in ((version_name(), "with --split sealed"), ("tunnelcd 0.0.1", "with --split sealed:0.0.1")):
         sealed = read(tmp_path / version, table((7, 8, 9)), f"sealed by {version}")
         found = compare_with_reference(own(frame), "mine", [sealed], {})
         assert found.table["method"].tolist() == ["mine"] and len(found.pairs) == 3
@@ -131,6 +131,32 @@ def test_pairs_of_one_name_that_are_other_worlds_are_told(tmp_path: Path) -> Non
         data = take_other_methods(read(tmp_path / str(n_other), reference), "mine")
         found = compare_with_reference(own(frame), "mine", [data], {})
         assert sum("other changes or another drive (narrow 2)" in note for note in found.notes) == n_other
+
+
+def test_pairs_of_another_commit_are_told(tmp_path: Path) -> None:
+    frame = table().assign(commit="1234567890")
+    for commit, n_told in (("1234567890", 0), ("abcdefabcd", 1)):
+        data = take_other_methods(read(tmp_path / commit, frame.assign(commit=commit)), "mine")
+        found = compare_with_reference(own(frame), "mine", [data], {})
+        assert sum(f"of {commit} are of commit {commit[:7]}:" in note for note in found.notes) == n_told
+    elsewhere = read(tmp_path / "elsewhere", table((7, 8, 9)).assign(commit="abcdefabcd"))
+    assert not any("of commit" in note for note in compare_with_reference(own(frame), "mine", [elsewhere], {}).notes)
+
+
+def test_who_refuses_an_unchanged_pair_counts_as_alarmed(tmp_path: Path) -> None:
+    frame = table().assign(is_unchanged_pair=True, is_alarm=0.0)
+    undefined = ["region_recall", "object_iou_point", "object_f1_50"]
+    frame.loc[:, undefined] = math.nan
+    refused = frame["status"] == "failed"
+    frame.loc[refused, ["false_regions_per_100m", "is_alarm"]] = math.nan
+    frame.loc[frame["variant"] == "tunnelcd", "is_alarm"] = [1.0, 0.0, 0.0]
+    data = take_other_methods(read(tmp_path / "run", frame), "mine")
+    found = compare_with_reference(own(frame), "mine", [data], {})
+    assert found.table["is_alarm"].tolist() == [pytest.approx(1 / 3), pytest.approx(1 / 3), 0.0]
+    lines = list_lines(found)
+    assert "alarms" in lines[0]
+    assert "time" not in lines[0] and max(map(len, lines)) <= 80
+    assert any(line.split()[:2] == ["alarms", "0.00"] for line in lines)
 
 
 def test_a_name_that_leads_elsewhere_finds_no_reference(tmp_path: Path) -> None:

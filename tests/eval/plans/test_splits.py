@@ -58,6 +58,16 @@ def test_a_sealed_plan_is_the_plan_on_other_seeds(name: str) -> None:
     assert change_plan(plan).model_dump() == change_plan(plan, split="dev").model_dump()
 
 
+def test_the_seeds_of_an_earlier_version_can_be_had_and_those_of_a_later_one_not() -> None:
+    plan = load_plan("main")
+    sealed = change_plan(plan, split="sealed:0.1.0")
+    assert sealed.split == "sealed by tunnelcd 0.1.0"
+    assert sealed.seeds == seal_seeds(plan.seeds, "tunnelcd 0.1.0") != change_plan(plan, split="sealed").seeds
+    for split, told in (("sealed:99.0.0", "it or an earlier one"), ("seald", "dev, sealed or"), ("sealed:x", "dev, s")):
+        with pytest.raises(InputError, match=f"^--split {split}: .*{told}"):
+            change_plan(plan, split=split)
+
+
 def test_pairs_that_plans_share_stay_shared() -> None:
     def pairs(name: str) -> set[tuple[str, int]]:
         return {(cell.scenario, cell.seed) for cell in expand_cells(change_plan(load_plan(name), split="sealed"))}
