@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 
-from cdpipe.model.config import preset_names
+import pytest
+
+from cdpipe.model.config import load_config, preset_names
 from eval.plans.cells import expand_cells
+from eval.plans.files import plan_names
 from eval.plans.plan import load_plan
 from eval.plans.worlds import find_references, list_settings_over
 from scenarios import load_scenario, scenario_names
@@ -48,7 +51,7 @@ def test_main_judges_at_the_radius_and_threshold_of_regions() -> None:
 def test_parts_takes_one_part_away_at_a_time() -> None:
     found = expand_cells(load_plan("parts"))
     assert {cell.variant for cell in found} == {
-        "tunnelcd", "tunnelcd[map.consistency=none,map.movers=keep]",
+        "tunnelcd", "tunnelcd[map.movers=keep]", "tunnelcd[map.consistency=none,map.movers=keep]",
         "tunnelcd[map.consistency=scan-to-map,map.movers=keep]", "tunnelcd[merge.refine=local]",
         "tunnelcd[sphere.frames=sensor]", "tunnelcd[extract.recentre=false]", "tunnelcd[query.radius_m=4.5]",
     }  # fmt: skip
@@ -60,8 +63,16 @@ def test_parts_takes_one_part_away_at_a_time() -> None:
     thin = {label for label, _ in held}
     assert {list_settings_over(label, held[label, "tunnelcd"]) for label in thin} == {"sensor.sub_rays=1"}
     plain = {f"regions/{name}[odometry=kiss-icp]" for name in ("narrow", "wide", "network")}
-    assert {cell.scenario for cell in found} - thin == plain
+    # what frames of the path and closed loops are for
+    assert {cell.scenario for cell in found} - thin == plain | {"odometry/handheld", "odometry/turned", "loops/network"}
     assert len({cell.seed for cell in found}) >= 6 and all(20000 <= cell.seed < 30000 for cell in found)
+
+
+@pytest.mark.parametrize("name", plan_names())
+def test_a_plan_whose_presets_follow_the_width_of_the_drift_names_no_wide_worlds(name: str) -> None:
+    plan = load_plan(name)
+    if all(load_config(cell.preset).query.radius_m == "width" for cell in expand_cells(plan)):
+        assert plan.wide == ()
 
 
 def test_every_stress_is_held_against_the_same_pair_without_it() -> None:
@@ -109,6 +120,7 @@ def test_mine_has_ten_pairs_of_every_family_with_an_effect_beside_their_clean_tw
         *(f"{effect}wide" for effect in ("", "dynamic/", "dust/", "glare/")),
         "dust/haul",
     }
-    assert {"tunnelcd[map.movers=keep,extract.movers=keep]", "tunnelcd[map.airborne=keep]"} < {
-        cell.variant for cell in found
-    }
+    # all methods of `main` but that which merges otherwise
+    of_main = {*preset_names()} - {"frame", "every-keyframe", "kiss-matcher"}
+    ablations = {"tunnelcd[map.movers=keep,extract.movers=keep]", "tunnelcd[map.airborne=keep]"}
+    assert {cell.variant for cell in found} == of_main | ablations

@@ -12,11 +12,11 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.yamlfile import Document, validate
 from cdpipe.sensor.ouster import profile_names
 from eval.core.domains import domain_of
-from eval.plans.cells import expand_cells
-from eval.plans.plan import Plan, load_plan
+from eval.plans.plan import Plan
 from eval.plans.worlds import find_references
 from scenarios import load_scenario
 from scenarios.schema import Scenario
+from tests.eval.plans.shipped import cells_of, plan_of
 
 VALIDATION, TEST = range(10000, 20000), range(20000, 30000)
 METHODS = (
@@ -29,7 +29,7 @@ KISS_ICP = "[odometry=kiss-icp]"
 
 
 def pairs(name: str) -> set[tuple[str, int]]:
-    return {(cell.scenario, cell.seed) for cell in expand_cells(load_plan(name))}
+    return {(cell.scenario, cell.seed) for cell in cells_of(name)}
 
 
 def way_m(scenario: Scenario) -> float:
@@ -45,7 +45,7 @@ def scenario_of(label: str) -> str:
 
 @pytest.mark.parametrize("name", ["main", "regions", "null", "objects"])
 def test_every_pair_is_made_with_both_odometries_and_the_figures_are_those_of_kiss_icp(name: str) -> None:
-    plan = load_plan(name)
+    plan = plan_of(name)
     assert plan.targets.odometry == "kiss-icp"
     plain = [world for world in plan.worlds if not world.common]
     own, kiss = ({world.name: world for world in plain if world.odometry == each} for each in ("own", "kiss-icp"))
@@ -60,16 +60,16 @@ def test_every_pair_is_made_with_both_odometries_and_the_figures_are_those_of_ki
         assert {scenario.before.odometry.source, scenario.after.odometry.source} == {source}
 
 
-def test_objects_has_pairs_of_every_profile_of_an_os1_32_and_asks_for_the_same_of_each() -> None:
-    plan = load_plan("objects")
+def test_objects_has_pairs_of_every_profile_and_asks_for_the_same_of_each() -> None:
+    plan = plan_of("objects")
     nominal = plan.targets.sensor
-    others = {name for name in profile_names() if name.startswith("os1-32") and name != nominal}
+    others = {*profile_names()} - {nominal}
     profiles = {load_scenario(world.name, plan.seeds[0], world.settings).sensor.profile for world in plan.worlds}
     assert profiles == {nominal, *others}
     asked = {(each.sensor, each.less_sensor, each.at_least) for each in plan.targets.objects if each.sensor}
     assert asked == {(name, "", 0.85) for name in others} | {(name, nominal, -0.05) for name in others}
     # each such pair stands beside one of the nominal sensor, and effects.csv compares them
-    found = find_references((cell.scenario, cell.variant, cell.seed) for cell in expand_cells(plan))
+    found = find_references((cell.scenario, cell.variant, cell.seed) for cell in cells_of("objects"))
     for world in plan.worlds:
         if world.common:
             assert found[world.label, "tunnelcd"] == f"{world.name}[odometry=kiss-icp]"
@@ -81,14 +81,15 @@ def test_regions_has_sixty_test_pairs_in_and_out_of_distribution() -> None:
     assert counts.total() >= 60
     assert sum(n for name, n in counts.items() if name.endswith(KISS_ICP)) >= 48
     assert {domain_of(scenario_of(name)) for name in counts if name.endswith(KISS_ICP)} == {"in", "out"}
-    assert load_plan("regions").report == ("regions",)
+    assert plan_of("regions").report == ("regions",)
 
 
 def test_pairs_that_plans_share_are_simulated_and_mapped_once_in_a_common_folder() -> None:
     shared = pairs("regions")
     assert pairs("main") < shared
     assert {(name, seed) for name, seed in pairs("objects") if "sensor.profile" not in name} < shared
-    assert {(name, seed) for name, seed in pairs("parts") if "sensor.sub_rays" not in name} < shared
+    of_parts = {(name, seed) for name, seed in pairs("parts") if name.startswith("regions/")}
+    assert {(name, seed) for name, seed in of_parts if "sensor.sub_rays" not in name} < shared
 
 
 def test_null_drives_five_kilometres_where_nothing_changed() -> None:
@@ -100,7 +101,7 @@ def test_null_drives_five_kilometres_where_nothing_changed() -> None:
     assert {scenario.after.route[0] == scenario.before.route[-1] for scenario in scenarios} == {True, False}
     assert min(scenario.after.end_m for scenario in scenarios) < 5 < 40 < max(s.after.end_m for s in scenarios)
     assert len(scenarios) >= 40  # one in twenty of fewer would be all or none
-    assert load_plan("null").report == ("regions",)
+    assert plan_of("null").report == ("regions",)
 
 
 def test_thresholds_are_set_on_twenty_validation_pairs_of_each_trained_family() -> None:
@@ -115,7 +116,7 @@ def test_thresholds_are_set_on_twenty_validation_pairs_of_each_trained_family() 
     [("regions", TEST, {"random-regions"}), ("null", TEST, set()), ("calibrate", VALIDATION, VISIBILITY)],
 )
 def test_every_method_runs_on_the_seeds_that_are_its(name: str, seeds: range, others: set[str]) -> None:
-    found = expand_cells(load_plan(name))
+    found = cells_of(name)
     assert {cell.seed for cell in found} <= set(seeds)
     assert {cell.preset for cell in found} == {*METHODS, *others}
     for cell in found:
@@ -125,7 +126,7 @@ def test_every_method_runs_on_the_seeds_that_are_its(name: str, seeds: range, ot
 
 def test_the_two_plans_of_test_pairs_judge_at_the_same_thresholds() -> None:
     found = {
-        name: {(c.variant, c.scenario.partition("/")[2]): c.config.query for c in expand_cells(load_plan(name))}
+        name: {(c.variant, c.scenario.partition("/")[2]): c.config.query for c in cells_of(name)}
         for name in ("regions", "null")
     }
     shared = found["regions"].keys() & found["null"].keys()
