@@ -24,6 +24,7 @@ import traceback
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -40,9 +41,10 @@ if sys.platform != "win32":
 Arrays = dict[str, npt.NDArray[Any]]
 Message = tuple[dict[str, Any], Arrays]
 
-# A hundred times what one revolution of the largest sensor takes. A library may start one thread per core, and each
-# has a stack of 8 MB and a heap of its own.
-MEMORY_BYTES = 512 << 20
+# Ninety times what one revolution of the largest sensor takes, and ten times the file: a library may hold a whole cloud
+# several times over. 20 million points of 48 bytes, decompressed and sorted by field, take 2.3 GB. A library may start
+# one thread per core, and each has a stack of 8 MB, of which it uses little, and a heap of its own.
+MEMORY_BYTES, _MEMORY_RATIO, _MOST_MEMORY_BYTES = 450_000_000, 10, 3_000_000_000
 _MEMORY_BYTES_PER_CORE = 16 << 20
 # CPU time from one message to the next: the least, and the file size per further second. Reading is ten times faster.
 CPU_S = 6
@@ -53,6 +55,7 @@ _MAX_HEADER_BYTES = 16 << 20
 _MAX_MESSAGE_BYTES = 1 << 30
 _MAX_WRITTEN_BYTES = 1 << 20
 _NO_TIME, _NO_MEMORY = "took too long to read it", "ran out of memory while it read it"
+_COPY, _SMALLER = "copy it again, or record it again", "thin it or split it; where it is damaged, copy it again"
 # Imports this package by its file, so that the folder that holds it is not on the path.
 _START = """
 import importlib, importlib.util as util, json, os, sys
@@ -77,7 +80,7 @@ class IsolatedReader:
 
         Args:
             module: Module whose functions are called; it is imported only in that process.
-            path: The file, for messages and for the limit on CPU time.
+            path: The file, or a folder of files, for messages and for the limits on CPU time and memory.
             library: Name of the native library in messages, e.g. "the vendor's SDK".
         """
         self._module, self._path, self._library = module, path, library
@@ -86,21 +89,26 @@ class IsolatedReader:
     def read(self, function: str, **arguments: Any) -> Iterator[Message]:
         """Call a generator function with JSON arguments, and yield what it yields: a dict and named arrays.
 
-        A caller may stop early. The process is then replaced for the next request.
+        With an argument `path`, messages and limits are of that file. A caller may stop early. The process is then
+        replaced for the next request.
 
         Raises:
             InputError: The function raised it, or its process crashed or exceeded a limit.
             RuntimeError: The function raised another exception; the text is its traceback.
         """
         process, self._process = self._process or _Process(), None
-        budget_s = CPU_S + size_of(self._path) // _BYTES_PER_CPU_S
+        path = Path(arguments.get("path", self._path))
+        n_bytes = size_of(path)
+        budget_s = CPU_S + n_bytes // _BYTES_PER_CPU_S
+        limits = {"cpu_s": budget_s, "memory_bytes": memory_limit(n_bytes)}
         try:
-            process.send({"module": self._module, "function": function, "arguments": arguments, "cpu_s": budget_s})
+            process.send({"module": self._module, "function": function, "arguments": arguments, **limits})
             while (message := process.receive(_WAIT_FACTOR * budget_s)) is not None:
                 yield message
         except _EndedError as end:
             process.close()
-            raise InputError(f"{self._path}: {self._library} {end}: copy it again, or record it again") from end
+            way_out = _SMALLER if str(end) == _NO_MEMORY else _COPY
+            raise InputError(f"{path}: {self._library} {end}: {way_out}") from end
         except InputError:  # the process lives and has answered
             self._process = process
             raise
@@ -122,9 +130,15 @@ class _ArrayHeader:
 
 
 def size_of(path: Path) -> int:
-    """Return the bytes of a file, or of all files in a folder, as a ROS 2 bag is."""
-    files = (each for each in path.rglob("*") if each.is_file()) if path.is_dir() else (path,)
-    return sum(each.stat().st_size for each in files)
+    """Return the bytes of a file, or of all files in a folder, as a ROS 2 bag is; 0 of what is not there."""
+    files = path.rglob("*") if path.is_dir() else (path,)
+    return sum(each.stat().st_size for each in files if each.is_file())
+
+
+def memory_limit(n_bytes: int) -> int:
+    """Return how many bytes more a process may take that reads a file of `n_bytes`."""
+    most_bytes = min(MEMORY_BYTES + _MEMORY_RATIO * n_bytes, _MOST_MEMORY_BYTES)
+    return most_bytes + (os.cpu_count() or 1) * _MEMORY_BYTES_PER_CORE
 
 
 def _command() -> list[str]:
@@ -269,7 +283,7 @@ def _answer(request: Mapping[str, Any], send: Callable[[str, Any, Arrays], None]
     try:
         limit_time(request["cpu_s"])
         module = import_module(request["module"])
-        limit_memory(MEMORY_BYTES + (os.cpu_count() or 1) * _MEMORY_BYTES_PER_CORE, _MAX_WRITTEN_BYTES)
+        limit_memory(request["memory_bytes"], _MAX_WRITTEN_BYTES)
         messages: Iterable[Message] = getattr(module, request["function"])(**request["arguments"])
         for value, arrays in messages:
             send("message", value, arrays)
@@ -307,18 +321,24 @@ def limit_time(cpu_s: float) -> None:
 def limit_memory(most_bytes: int, most_written_bytes: int | None = None) -> None:
     """Let the process take so many bytes more, and write neither a larger file nor a core dump.
 
+    The bytes count from the first call in a process on; a later call may let it take more, or less.
     RLIMIT_DATA counts what is private and writable, which is what a parser allocates. RLIMIT_AS would also count the
     shared libraries, the file where a library maps it, and the address space that the heap of each thread reserves:
     64 MB that are hardly used.
     """
     if sys.platform == "win32":
         return
-    statm = Path("/proc/self/statm")
-    held = int(statm.read_text().split()[5]) * resource.getpagesize() if statm.exists() else 0
-    _limit(resource.RLIMIT_DATA, held + most_bytes)
+    _limit(resource.RLIMIT_DATA, _held_bytes() + most_bytes, resource.getrlimit(resource.RLIMIT_DATA)[1])
     if most_written_bytes is not None:
         _limit(resource.RLIMIT_FSIZE, most_written_bytes)
     _limit(resource.RLIMIT_CORE, 0)
+
+
+@cache
+def _held_bytes() -> int:
+    """Return the private and writable bytes of this process at the first call."""
+    statm = Path("/proc/self/statm")
+    return int(statm.read_text().split()[5]) * resource.getpagesize() if statm.exists() else 0
 
 
 def _limit(kind: int, most: int, hard: int | None = None) -> None:

@@ -1,4 +1,7 @@
-"""Tracing: the drivable or flyable centreline of a mesh that somebody else made, and a scenario along it."""
+"""Tracing: the centrelines, on the floor, of a mesh that somebody else made, and a scenario along them.
+
+Shafts and raises, through which one can only fly, are left out; a note says where.
+"""
 
 import lazy_loader
 

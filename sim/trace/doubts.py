@@ -9,6 +9,7 @@ import numpy as np
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array
 from scenarios.schema import MeshFile
+from scenarios.schema.tunnel import FARTHEST_M
 from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 from sim.rock.foreign import UNIT_M
@@ -84,6 +85,23 @@ def judge_width(width_m: float, file: MeshFile, is_sure: bool) -> list[str]:
     if file.units in likely or is_sure:
         return []
     return [f"its drifts are {told}: if that is not so, {f'give {units}' if units else 'scale the file'}"]
+
+
+def refuse_far(mesh: Mesh, file: MeshFile) -> None:
+    """Refuse a mesh that lies where the simulator loses millimetres, as in the coordinates of a map grid (UTM).
+
+    Raises:
+        ScenarioError: With the offset that brings it near the origin.
+    """
+    reach_m = float(np.abs(mesh.vertices).max())
+    if reach_m <= FARTHEST_M:
+        return
+    middle_m = mesh.vertices.mean(axis=0)
+    x, y, z = (f"{value:.0f}" for value in np.round(middle_m, -2) + 0.0)
+    raise ScenarioError(
+        f"{file.path}: lies {reach_m / 1000:.0f} km from the origin, where millimetres are lost: move it near the "
+        f"origin: subtract ({x}, {y}, {z}) m (z up) from the coordinates of the mesh"
+    )
 
 
 def refuse_turned(mesh: Mesh, file: MeshFile, is_sure: bool) -> None:

@@ -19,7 +19,15 @@ from sim.geometry.topology import edges_of
 from sim.rock.axis import find_nearest
 from sim.rock.centreline import build_centreline
 from sim.rock.foreign import TUNNEL_KEY, read_mesh, refuse_disagreeing, refuse_tunnel
-from sim.trace.doubts import is_inside_out, judge_roof, judge_width, refuse_turned, tell_parts, typical_width_m
+from sim.trace.doubts import (
+    is_inside_out,
+    judge_roof,
+    judge_width,
+    refuse_far,
+    refuse_turned,
+    tell_parts,
+    typical_width_m,
+)
 from sim.trace.graph import TracedDrift, join_drifts, name_nodes
 from sim.trace.inside import Void, count_cells, find_inside
 from sim.trace.middle import Middle, find_middle, is_steep
@@ -83,6 +91,7 @@ def trace_mesh(
     tell("read the mesh", 0, 4)
     walls = _read_walls(file)
     notes = judge_width(walls.width_m, walls.file, is_sure_of_units)
+    refuse_far(walls.mesh, walls.file)  # in wrong units it lies far away, too
     refuse_turned(walls.mesh, walls.file, is_sure_of_up)
     tell("find the inside", 1, 4)
     void = find_inside(walls.mesh, walls.caster, _choose_cell_m(walls))

@@ -13,6 +13,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,6 +35,7 @@ _MOST_POINTS = 10_000_000
 _MOST_POSES = 2_000_000
 _MOST_TOPICS = 10_000
 _MOST_FRAMES = 8
+_STAMPS_AT_ONCE = 50  # 5 s of a recording
 _ERRORS = (
     OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, AssertionError,
     UnicodeError, EOFError,
@@ -54,16 +56,23 @@ def list_topics(path: str) -> Iterator[Message]:
 
 
 def read_stamps(path: str, topic: str) -> Iterator[Message]:
-    """Yield the stamps (S,) int64 ns of a cloud topic's headers, whether each has returns, and their frames, sorted."""
+    """Yield the stamps (S,) int64 ns of a cloud topic's headers, whether each has returns, and their frames, sorted.
+
+    They come `_STAMPS_AT_ONCE` clouds at a time, as every cloud of a long recording is read for them.
+    """
     with _bag(path) as bag:
-        stamps, has_returns, frames = [], [], set()
-        for message, _ in _messages(bag, [topic]):
-            frames.add(str(message.header.frame_id).lstrip("/"))
-            stamps.append(_nanoseconds(message.header.stamp))
-            points = _cloud(message)["points"]
-            has_returns.append(bool((np.isfinite(points).all(axis=1) & points.any(axis=1)).any()))
-    about = {"frames": sorted(frames - {""})[:_MOST_FRAMES]}
-    yield about, {"stamps": np.array(stamps, np.int64), "has_returns": np.array(has_returns, np.uint8)}
+        messages = (message for message, _ in _messages(bag, [topic]))
+        while clouds := [_head(message) for message in islice(messages, _STAMPS_AT_ONCE)]:
+            frames, stamps, has_returns = zip(*clouds, strict=True)
+            about = {"frames": sorted(set(frames) - {""})[:_MOST_FRAMES]}
+            yield about, {"stamps": np.array(stamps, np.int64), "has_returns": np.array(has_returns, np.uint8)}
+
+
+def _head(message: Any) -> tuple[str, int, bool]:
+    """Return the frame and the stamp of a cloud, and whether it has returns."""
+    points = _cloud(message)["points"]
+    has_returns = bool((np.isfinite(points).all(axis=1) & points.any(axis=1)).any())
+    return str(message.header.frame_id).lstrip("/"), _nanoseconds(message.header.stamp), has_returns
 
 
 def read_clouds(path: str, topic: str) -> Iterator[Message]:

@@ -15,6 +15,7 @@ from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, ma
 from cdpipe.core.isolated_reader import IsolatedReader
 from cdpipe.core.names import visible
 from cdpipe.core.plugins import require_extra
+from cdpipe.core.progress import Progress
 from cdpipe.io.foreign.bag_files import CLOUD, ODOMETRY, POSE, TRANSFORMS
 from cdpipe.io.foreign.clouds import Cloud, check_cloud
 from cdpipe.io.foreign.trajectory import Trajectory
@@ -53,13 +54,14 @@ class BagScans:
 
     is_stream = True
 
-    def __init__(self, path: Path, topics: Sequence[str], is_posed: bool) -> None:
-        """List the topics, choose that of the clouds, and read the poses.
+    def __init__(self, path: Path, topics: Sequence[str], is_posed: bool, report: Progress) -> None:
+        """List the topics, choose that of the clouds, look through these, and read the poses.
 
         Args:
             path: The bag.
             topics: Topics that a person names.
             is_posed: Whether the poses come from elsewhere.
+            report: Called with "look through", the number of clouds looked at and the number that is announced.
 
         Raises:
             InputError: It is no bag, holds no clouds or several topics of them, or its poses cannot be used.
@@ -75,17 +77,9 @@ class BagScans:
             way = "; `tunnelcd convert` one of two recordings first if their topics differ" if len(topics) > 1 else ""
             raise InputError(f"{path}: --topic {unknown[0]}: not in it: it holds {self._listed()}{way}")
         self._topic = self._choose(CLOUD, topics, "PointCloud2")
-        ((about, arrays),) = self._reader.read("read_stamps", path=self.name, topic=self._topic)
-        self._frame = self._require_one_frame([str(frame) for frame in about["frames"]])
-        stamps: Int64Array = arrays["stamps"]
-        if not len(stamps):
-            raise InputError(f"{path}: {self._topic}: no cloud can be read from it")
-        n_announced = sum(count for name, _, count in self._topics if name == self._topic)
-        if len(stamps) < n_announced:
-            told = f"{len(stamps)} of {n_announced} clouds can be read: the bag is cut short or damaged: copy it again"
-            warnings.warn(f"{path}: {self._topic}: {told}", InputWarning, stacklevel=2)
+        stamps, has_returns = self._look_through(report)
         # cloud of the topic that each scan is, scans in the order of their stamps
-        self._numbers = self._sort(np.flatnonzero(self._find_returns(arrays["has_returns"] > 0)), stamps)
+        self._numbers = self._sort(np.flatnonzero(self._find_returns(has_returns)), stamps)
         stamps = stamps[self._numbers]
         self.stamps_s: Float64Array | None = stamps / 1e9
         self.lacks = f"no poses of the sensor in it (it holds {self._listed()})"
@@ -124,6 +118,28 @@ class BagScans:
             while done in waiting:
                 yield waiting.pop(done)
                 done += 1
+
+    def _look_through(self, report: Progress) -> tuple[Int64Array, BoolArray]:
+        """Return the stamps (S,) of the clouds and whether each has returns, and keep their frame."""
+        n_announced = sum(count for name, _, count in self._topics if name == self._topic)
+        stamps, has_returns = [np.zeros(0, np.int64)], [np.zeros(0, np.bool_)]
+        frames: set[str] = set()
+        n_done = 0
+        report("look through", n_done, n_announced)
+        for about, arrays in self._reader.read("read_stamps", path=self.name, topic=self._topic):
+            frames.update(str(frame) for frame in about["frames"])
+            stamps.append(arrays["stamps"])
+            has_returns.append(arrays["has_returns"] > 0)
+            n_done += len(stamps[-1])
+            report("look through", n_done, max(n_done, n_announced))
+        self._frame = self._require_one_frame(sorted(frames)[:_LISTED])
+        if not n_done:
+            raise InputError(f"{self._path}: {self._topic}: no cloud can be read from it")
+        if n_done < n_announced:
+            told = f"{n_done} of {n_announced} clouds can be read: the bag is cut short or damaged: copy it again"
+            warnings.warn(f"{self._path}: {self._topic}: {told}", InputWarning, stacklevel=2)
+        report("look through", n_done, n_done)
+        return np.concatenate(stamps), np.concatenate(has_returns)
 
     def _sort(self, numbers: Int64Array, stamps: Int64Array) -> Int64Array:
         """Return the clouds (S,) in the order of their stamps, each stamp once."""

@@ -1,4 +1,4 @@
-"""Folders with one file per scan: PLY, PCD, LAS and KITTI, with the trajectory and the times that lie in them; E57."""
+"""Folders with one file per scan: PLY, PCD, LAS and KITTI, with their trajectory and times; E57, one or several."""
 
 from __future__ import annotations
 
@@ -58,14 +58,15 @@ def open_folder(folder: Path, name: str, has_poses: bool) -> Clouds:
 def _require_padded(folder: Path, files: list[Path]) -> None:
     if stamps_of_names(files) is not None:  # 1700000000.15 before 1700000000.2
         return
-    by_number = sorted(
-        files, key=lambda file: [int(part) if part.isdigit() else part for part in _NUMBERS.split(file.name)]
-    )
-    if by_number != files:
+    if sorted(files, key=_by_number) != files:
         raise InputError(
             f"{folder}: the *{files[0].suffix} files are numbered without leading zeros, so that their names sort as "
             f"{files[0].name}, {files[1].name}, ...: pad the numbers to equal length"
         )
+
+
+def _by_number(file: Path) -> list[int | str]:
+    return [int(part) if part.isdigit() else part for part in _NUMBERS.split(file.name)]
 
 
 def _find_poses(folder: Path, scans: Path, name: str) -> Trajectory | None:
@@ -148,44 +149,69 @@ def _with_viewpoints(clouds: CloudFiles, folder: Path, files: list[Path]) -> Clo
 
 
 class E57Scans:
-    """The scans of an E57 file, one for each place where the scanner stood: `Clouds`."""
+    """The scans of an E57 file, or of all E57 files of a folder, one for each place where a scanner stood: `Clouds`."""
 
     is_stream = False
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, has_poses: bool) -> None:
+        """List the scans; those of a folder are in the order of the numbers in the names of its files.
+
+        Args:
+            path: The file or folder.
+            has_poses: Whether the poses come from elsewhere, so that none are looked for.
+
+        Raises:
+            InputError: There are no scans, too many or too large ones, or their poses cannot be used.
+        """
         require_extra("formats", str(path))
         self.name, self.lacks = str(path), "no pose of its scans in it"
         self.stamps_s: Float64Array | None = None
         self._path, self._reader = path, IsolatedReader("cdpipe.io.foreign.points_files", path, "pye57")
-        heads = [about for about, _ in self._reader.read("read_e57_heads", path=str(path))]
-        if not 0 < len(heads) <= _MOST_SCANS:
-            raise InputError(f"{path}: {len(heads)} scans: expected 1 to {_MOST_SCANS}")
-        self._n = len(heads)
-        for index, head in enumerate(heads):
-            if not 0 <= head["points"] <= MOST_POINTS:
-                raise InputError(
-                    f"{self.where(index)}: {head['points']} points: at most {MOST_POINTS} are read: thin it"
-                )
-        self.own: Trajectory | None = None
-        if all(head["pose"] is not None for head in heads):
-            rows = np.array([head["pose"] for head in heads], np.float64)[:, [0, 1, 2, 4, 5, 6, 3]]
-            require_unit_poses(rows, self.where)
-            poses = make_pose(Rotation.from_quat(rows[:, 3:]).as_matrix(), rows[:, :3])
-            self.own = Trajectory(str(path), poses)
+        files = find_scans(path, "e57") if path.is_dir() else [path]
+        if stamps_of_names(files) is None:
+            files.sort(key=_by_number)
+        self._scans: list[tuple[Path, int]] = []
+        poses: list[list[float] | None] = []
+        for file in files:
+            for number, (about, _) in enumerate(self._reader.read("read_e57_heads", path=str(file))):
+                self._scans.append((file, number))
+                _require_few(self.where(-1), about["points"])
+                poses.append(about["pose"])
+        if not 0 < len(self) <= _MOST_SCANS:
+            raise InputError(f"{path}: {len(self)} scans: expected 1 to {_MOST_SCANS}")
+        self.own: Trajectory | None = None if has_poses else self._make_poses(poses)
+        if self.own is None and path.is_dir():
+            _require_padded(path, sorted(files))
+
+    def _make_poses(self, poses: list[list[float] | None]) -> Trajectory | None:
+        """Return the poses of the scanner, those of x, y, z and qw, qx, qy, qz in E57; None if a scan has none."""
+        known = [pose for pose in poses if pose is not None]
+        if len(known) < len(poses):
+            return None
+        rows = np.array(known, np.float64)[:, [0, 1, 2, 4, 5, 6, 3]]
+        require_unit_poses(rows, self.where)
+        return Trajectory(self.name, make_pose(Rotation.from_quat(rows[:, 3:]).as_matrix(), rows[:, :3]))
 
     def __len__(self) -> int:
         """Return the number of scans."""
-        return self._n
+        return len(self._scans)
 
     def where(self, index: int) -> str:
         """Name a scan."""
-        return f"{self._path}: scan {index}"
+        file, number = self._scans[index]
+        return f"{file}: scan {number}"
 
     def read(self, index: int) -> Cloud:
         """Read one scan."""
-        ((_, arrays),) = self._reader.read("read_e57", path=str(self._path), index=index)
+        file, number = self._scans[index]
+        ((_, arrays),) = self._reader.read("read_e57", path=str(file), index=number)
         return check_cloud(self.where(index), arrays)
 
     def read_all(self) -> Iterator[Cloud]:
         """Read all scans."""
-        return (self.read(index) for index in range(self._n))
+        return (self.read(index) for index in range(len(self)))
+
+
+def _require_few(where: str, n_points: int) -> None:
+    if not 0 <= n_points <= MOST_POINTS:
+        raise InputError(f"{where}: {n_points} points: at most {MOST_POINTS} are read: thin it")

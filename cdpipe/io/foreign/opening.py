@@ -20,7 +20,7 @@ from cdpipe.core.geometry import Float64Array
 from cdpipe.core.geometry.motion import Motion
 from cdpipe.core.plugins import require_extra
 from cdpipe.core.progress import Progress
-from cdpipe.io.foreign.clouds import Clouds, point_times
+from cdpipe.io.foreign.clouds import Cloud, Clouds, point_times
 from cdpipe.io.foreign.folders import E57Scans, open_folder
 from cdpipe.io.foreign.points_files import cloud_reader
 from cdpipe.io.foreign.scans import PosedClouds, in_sensor_frames
@@ -108,7 +108,7 @@ def open_recording(path: Path, how: HowToRead, report: Progress) -> PosedClouds:
     Raises:
         InputError: It cannot be read, has no poses, or they do not fit its scans.
     """
-    source = _pose(_open_clouds(path, how), how, report)
+    source = _pose(_open_clouds(path, how, report), how, report)
     source.is_whole_map = isinstance(source.clouds, MapStations)
     if source.is_whole_map:
         return source
@@ -129,7 +129,7 @@ def convert_recording(path: Path, out: Path, how: HowToRead, report: Progress) -
     Raises:
         InputError: As `open_recording`, or the folder cannot be written.
     """
-    source = _pose(_open_clouds(path, how), how, report)
+    source = _pose(_open_clouds(path, how, report), how, report)
     if isinstance(source.clouds, MapStations):
         raise InputError(f"{path}: a map without its scans is no session: `detect` takes it as it is")
     if source.clouds.is_stream:
@@ -184,25 +184,37 @@ def _removed_on_error(folder: Path) -> Iterator[Path]:
         raise
 
 
-def _open_clouds(path: Path, how: HowToRead) -> Clouds:
+def _open_clouds(path: Path, how: HowToRead, report: Progress) -> Clouds:
     """Open what holds the scans; poses are not looked for where a person says where they come from."""
     name = how.format or guess_format(path)
+    is_posed = how.trajectory is not None or how.odometry is not None
     if name == "e57":
-        return E57Scans(path)
+        return _open_e57(path, how, is_posed)
     if name == "bag":
         from cdpipe.io.foreign.bags import BagScans  # noqa: PLC0415 - not before a bag is read
 
-        return BagScans(path, how.topics, is_posed=how.trajectory is not None or how.odometry is not None)
+        return BagScans(path, how.topics, is_posed, report)
     if not FORMATS[name].in_folders:
         raise InputError(f"{path}: --format {name}: not here: expected a file that is {FORMATS[name].about}")
     if path.is_dir():
-        return open_folder(path, name, has_poses=how.trajectory is not None or how.odometry is not None)
-    if how.trajectory is not None or how.odometry is not None:
+        return open_folder(path, name, has_poses=is_posed)
+    if is_posed:
         raise InputError(
             f"{path}: one cloud, a map without its scans, has no poses: leave --trajectory and --odometry out, or name "
             "a folder with one file per scan"
         )
-    cloud = cloud_reader(name, path)(path)
+    return _stations(path, cloud_reader(name, path)(path), how)
+
+
+def _open_e57(path: Path, how: HowToRead, is_posed: bool) -> Clouds:
+    """Open E57 scans; a single one without a pose is a whole map, as one cloud of another format is."""
+    scans = E57Scans(path, has_poses=is_posed)
+    if len(scans) == 1 and scans.own is None and not is_posed:
+        return _stations(path, scans.read(0), how)
+    return scans
+
+
+def _stations(path: Path, cloud: Cloud, how: HowToRead) -> MapStations:
     return MapStations(path, replace(cloud, points=cloud.points - np.array(how.origin_m)))
 
 

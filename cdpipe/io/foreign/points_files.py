@@ -179,10 +179,10 @@ def read_e57(path: str, index: int) -> Iterator[Message]:
     with _reads(path, "an E57 file"):
         data = pye57.E57(path).read_scan(index, intensity=True, ignore_missing_fields=True, transform=False)
         if "sphericalRange" in data:
-            turned = np.column_stack([data[f"spherical{part}"] for part in ("Range", "Azimuth", "Elevation")])
+            turned = np.column_stack([data.pop(f"spherical{part}") for part in ("Range", "Azimuth", "Elevation")])
             points = convert_spherical_to_cartesian(turned)
         else:
-            points = np.column_stack([data[f"cartesian{axis}"] for axis in "XYZ"])
+            points = np.column_stack([data.pop(f"cartesian{axis}") for axis in "XYZ"])
     shone = {"intensity": data["intensity"]} if "intensity" in data else {}
     yield {}, {"points": points, **shone}
 

@@ -27,12 +27,14 @@ class Format:
         suffixes: Of its files, lower case.
         magic: Byte position and bytes that its files begin with; empty for none.
         in_folders: Whether a folder may hold one file per scan.
+        has_several: Whether a file may hold several scans, and a folder several such files.
     """
 
     about: str
     suffixes: tuple[str, ...] = ()
     magic: tuple[tuple[int, bytes], ...] = ()
     in_folders: bool = False
+    has_several: bool = False
 
 
 _PCAP = (b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x0a\x0d\x0d\x0a")
@@ -42,7 +44,7 @@ FORMATS = {
     "pcd": Format("PCD scans", (".pcd",), ((0, b"# .PCD"), (0, b"VERSION"), (0, b"#.PCD")), in_folders=True),
     "las": Format("LAS, LAZ or COPC scans", (".las", ".laz"), ((0, b"LASF"),), in_folders=True),
     "kitti": Format("KITTI or nuScenes .bin scans (float32 x, y, z, intensity)", (".bin",), in_folders=True),
-    "e57": Format("E57", (".e57",), ((0, b"ASTM-E57"),)),
+    "e57": Format("E57", (".e57",), ((0, b"ASTM-E57"),), has_several=True),
     "bag": Format(
         "a ROS 1 bag, ROS 2 bag or MCAP",
         (".bag", ".mcap", ".db3"),
@@ -105,7 +107,8 @@ def _formats_in(folder: Path) -> dict[str, int]:
     """Return the formats in a folder with their numbers of files."""
     if (folder / "session.json").is_file():
         return {"session": 1}
-    counts = {name: len(find_scans(folder, name)) for name, each in FORMATS.items() if each.in_folders}
+    named = [name for name, each in FORMATS.items() if each.in_folders or each.has_several]
+    counts = {name: len(find_scans(folder, name)) for name in named}
     if (folder / "metadata.yaml").is_file():  # its files may be compressed: x.db3.zstd
         counts["bag"] = int(any({".db3", ".mcap"} & set(file.suffixes) for file in folder.iterdir()))
     else:
@@ -123,7 +126,7 @@ def _guess_folder(folder: Path) -> str:
     if not found:
         raise InputError(
             f"{folder}: no scans in it{_tell_content(folder)}: expected session.json (a session of ours), or *.ply, "
-            "*.pcd, *.las, *.laz or *.bin scans with a trajectory, or a bag"
+            "*.pcd, *.las, *.laz or *.bin scans with a trajectory, or *.e57 scans, or a bag"
         )
     return next(iter(found))
 

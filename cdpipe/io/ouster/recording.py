@@ -28,9 +28,12 @@ from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.io.foreign.trajectory import read_poses
 from cdpipe.io.ouster.beams import check_beams
 from cdpipe.io.ouster.captures import Recording, Revolution, open_recording
-from cdpipe.io.session import ScanChunk, SessionWriter, fit_chunk
+from cdpipe.io.readers import RecordedScans
+from cdpipe.io.session import ScanChunk, Session, SessionWriter, fit_chunk
 from cdpipe.io.tum import motion_along
 from cdpipe.mapping.poses.odometry import ODOMETRIES, Image, estimate_motion
+from cdpipe.mapping.poses.pose_check import check_quaternion_order
+from cdpipe.model.types import PosedScan, WrappedScans
 
 KISS_ICP = "kiss-icp"
 _OWN_POSE_TOLERANCE = 1e-9
@@ -55,12 +58,18 @@ class Imported:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Times:
-    """First, middle and last stamp (S,) of each revolution, whether it has poses (S,), and the number left out."""
+    """Of each revolution the first, middle and last stamp (S,), and whether it has poses and returns (S,); and counts.
+
+    Attributes:
+        n_left_out: Number of revolutions left out.
+        n_returns: Returns of each beam.
+    """
 
     first_ns: Int64Array
     middle_ns: Int64Array
     last_ns: Int64Array
     has_own_pose: BoolArray
+    has_returns: BoolArray
     n_left_out: int
     n_returns: int
 
@@ -88,7 +97,7 @@ def import_recording(
         on_progress: Called with the stage, the number of finished revolutions and their estimated total.
 
     Raises:
-        InputError: A file cannot be used, `out` exists, or there are no poses.
+        InputError: A file cannot be used, `out` exists, there are no poses, or those of the trajectory have w first.
     """
     if odometry is not None and odometry not in ODOMETRIES:
         raise InputError(f"--odometry {odometry}: expected {' or '.join(ODOMETRIES)}")
@@ -111,14 +120,40 @@ def import_recording(
     with SessionWriter(out, recording.sensor, chunk_scans, provenance, times.n_returns) as writer:
         odom_T_sensor = _write(writer, chunk_scans, recording, times, motion, report)
         odom_T_sensor[:, :3, 3] -= origin_m if odometry is None else (0.0, 0.0, 0.0)
+        if trajectory is not None:
+            written = Session(
+                writer.folder, recording.sensor, odom_T_sensor, chunk_scans, provenance, n_returns=times.n_returns
+            )
+            check_quaternion_order(_ScansWithReturns(written, times.has_returns), str(trajectory))
         writer.close(odom_T_sensor)
     sensor = f"{recording.sensor.product}, {recording.sensor.mode}"
     return Imported(len(times.first_ns), poses, sensor, times.n_left_out)
 
 
+class _ScansWithReturns(WrappedScans):
+    """The revolutions of a session that is still being written, without those that nothing came back from."""
+
+    def __init__(self, written: Session, has_returns: BoolArray) -> None:
+        super().__init__(RecordedScans(written))
+        self._kept = np.flatnonzero(has_returns)
+
+    @property
+    def odom_T_sensor(self) -> Float64Array:
+        """(S, 4, 4) pose of each."""
+        return self._source.odom_T_sensor[self._kept]
+
+    def scan(self, index: int) -> PosedScan:
+        """Read one revolution."""
+        return self._source.scan(int(self._kept[index]))
+
+    def scans(self) -> Iterator[PosedScan]:
+        """Read all of them in order."""
+        return (self.scan(index) for index in range(len(self._kept)))
+
+
 def _read_times(recording: Recording, report: Progress) -> _Times:
     stamps_ns: list[Int64Array] = []
-    has_own_pose, rows = [], set()
+    has_own_pose, has_returns, rows = [], [], set()
     left_out: list[int] = []
     middle = recording.sensor.width // 2
     for number, revolution in enumerate(recording.revolutions(left_out.append)):
@@ -128,6 +163,7 @@ def _read_times(recording: Recording, report: Progress) -> _Times:
             check_beams(first, recording.sensor, recording.metadata, recording.path)
         stamps_ns.append(revolution.column_stamps_ns[[0, middle, -1]])
         rows.add(len(revolution.range_mm))
+        has_returns.append(bool(revolution.range_mm.any()))
         off = np.abs(revolution.odom_T_column[revolution.is_valid] - recording.sensor_to_body)
         has_own_pose.append(off.max() > _OWN_POSE_TOLERANCE)
     report("look through", len(stamps_ns), len(stamps_ns))
@@ -135,7 +171,8 @@ def _read_times(recording: Recording, report: Progress) -> _Times:
         raise InputError(f"{recording.path}: some revolutions have two returns of each beam and some one: cut it there")
     first_ns, middle_ns, last_ns = np.array(stamps_ns).T
     n_returns = rows.pop() // recording.sensor.height
-    return _Times(first_ns, middle_ns, last_ns, np.array(has_own_pose), len(left_out), n_returns)
+    is_known = np.array(has_own_pose), np.array(has_returns)
+    return _Times(first_ns, middle_ns, last_ns, *is_known, len(left_out), n_returns)
 
 
 def _choose_motion(

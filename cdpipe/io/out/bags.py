@@ -42,10 +42,12 @@ def write_bag(path: Path, outgoing: Outgoing, kind: str, report: Progress) -> No
         report: Called with the stage, the number of finished scans and their total.
 
     Raises:
-        InputError: The extra `formats` is not installed, ROS cannot hold the times, or a scan cannot be read.
+        InputError: The extra `formats` is not installed, ROS cannot hold the times, it is a map without its scans, or
+            a scan cannot be read.
         OSError: The file cannot be written.
     """
     require_extra("formats", str(path))
+    outgoing.require_scans()
     _require_times(outgoing)
     messages = RosMessages(is_first=kind == "ros1")
     opened = _open_mcap(path, messages) if kind == "mcap" else _open_bag(path, messages)

@@ -44,9 +44,10 @@ def write_kitti(folder: Path, outgoing: Outgoing, labels: Sequence[Label], repor
         report: Called with the stage, the number of finished scans and their total.
 
     Raises:
-        InputError: A scan cannot be read.
+        InputError: It is a map without its scans, or a scan cannot be read.
         OSError: A file cannot be written.
     """
+    outgoing.require_scans()
     (folder / "velodyne").mkdir()
     if labels:
         (folder / "labels").mkdir()

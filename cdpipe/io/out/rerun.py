@@ -26,12 +26,13 @@ def write_rrd(path: Path, outgoing: Outgoing, report: Progress) -> None:
     Points are grey by intensity; those with a `change` above 0, which the caller adds, are red.
 
     Raises:
-        InputError: The extra `rerun` is not installed, or a scan cannot be read.
+        InputError: The extra `rerun` is not installed, it is a map without its scans, or a scan cannot be read.
         OSError: The file cannot be written.
     """
     require_extra("rerun", str(path))
     import rerun as rr
 
+    outgoing.require_scans()
     try:
         with rr.RecordingStream("tunnelcd", recording_id=path.stem.strip(".")) as stream:
             stream.save(str(path))

@@ -94,8 +94,22 @@ class Outgoing:
         last_ns = int(self.session.chunk(self.session.n_chunks - 1).column_stamps_ns.max()) + self.start_ns
         return first_ns / 1e9, last_ns / 1e9
 
+    def require_scans(self) -> None:
+        """Raise `InputError` of a whole map: its stations were no scans, and only a map can be made of it."""
+        if not self.has_scans:
+            told = "a map without its scans has no poses or times"
+            raise InputError(f"{self.name}: {told}: name a new .laz or .ply")
+
     def stamps_ns(self) -> Int64Array:
-        """Return the time (S,) of the pose of each scan."""
+        """Return the time (S,) of the pose of each scan.
+
+        Raises:
+            InputError: As `require_scans`.
+        """
+        self.require_scans()
+        return self._stamps_ns()
+
+    def _stamps_ns(self) -> Int64Array:
         if self.session is None:
             return np.round(self._posed_clouds().stamps_s * 1e9).astype(np.int64)
         middle = self.session.sensor.width // 2
@@ -108,7 +122,7 @@ class Outgoing:
         Raises:
             InputError: As `ScanSource.scans`.
         """
-        stamps_ns, start_ns = self.stamps_ns(), self.start_ns
+        stamps_ns, start_ns = self._stamps_ns(), self.start_ns
         for scan in self._source.scans():
             stamp_ns = int(stamps_ns[scan.index])
             offset_ns = scan.stamps_ns + start_ns - stamp_ns

@@ -38,6 +38,7 @@ def spin():
     while True: pass
 def wait(): time.sleep(60)
 def grow(): np.ones(1 << 32, "u1")
+def take(n, path): yield {}, {"n": np.array([np.ones(n, "u1").sum()])}
 def lie():
     for fd in range(3, 20):
         try: os.write(fd, b"\\xff" * 100)
@@ -109,6 +110,28 @@ def test_a_folder_has_the_time_of_its_files(tmp_path: Path) -> None:
         == 2 * isolated_reader.size_of(tmp_path / "bag" / "a.db3")
         == 120_000_000
     )
+
+
+def test_memory_grows_with_the_file_and_what_helps_is_told(
+    read: Callable[..., list[isolated_reader.Message]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(isolated_reader, "MEMORY_BYTES", 50_000_000)
+    monkeypatch.setattr(isolated_reader, "_MEMORY_BYTES_PER_CORE", 0)
+    for name, n_bytes in (("small.pcd", 100), ("large.pcd", 30_000_000)):
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(n_bytes)
+    small, large = (str(tmp_path / name) for name in ("small.pcd", "large.pcd"))
+    assert len(read("take", n=1000, path=small)) == 1
+    assert len(read("take", n=200_000_000, path=large)) == 1  # the same process
+    with pytest.raises(InputError, match=r"small\.pcd: the library ran out of memory .*: thin it or split it"):
+        read("take", n=200_000_000, path=small)
+
+
+@pytest.mark.parametrize("n_bytes", [0, 10**6, 240_000_000, 10**11])
+def test_memory_stays_below_the_promised_bound(n_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(isolated_reader.os, "cpu_count", lambda: 2)
+    assert isolated_reader.memory_limit(n_bytes) <= min(500_000_000 + 10 * n_bytes, 3_100_000_000)
+    assert isolated_reader.memory_limit(240_000_000) > 72 * 20_000_000  # an E57 of the most points, thrice in memory
 
 
 def test_a_reader_killed_before_its_answer_is_awaited_took_too_long(

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -121,6 +124,44 @@ def write_lases(folder: Path, made: Drive, suffix: str = ".laz") -> Path:
     return folder
 
 
+def write_copc(path: Path, points: Float64Array) -> Path:
+    """Write a COPC file by hand, as laspy writes none: a node for all, and one for the eighth below the middle."""
+    import laspy  # noqa: PLC0415
+    import lazrs  # noqa: PLC0415
+    from laspy.vlrs.known import LasZipVlr  # noqa: PLC0415
+
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = np.full(3, 1e-4), np.zeros(3)
+    header.mins, header.maxs = points.min(axis=0), points.max(axis=0)
+    header.point_count, header.are_points_compressed = len(points), True
+    laz = lazrs.LazVlr.new_for_compression(6, 0, use_variable_size_chunks=True)
+    header.vlrs.extend([laspy.VLR("copc", 1, "", bytes(160)), LasZipVlr(laz.record_data())])
+    middle = points.mean(axis=0)
+    is_below = (points < middle).all(axis=1)
+    with path.open("wb+") as file:
+        header.write_to(file)
+        compressor = lazrs.LasZipCompressor(file, laz)
+        for number, part in enumerate((points[~is_below], points[is_below])):
+            record = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
+            record.x, record.y, record.z = part.T
+            if number:
+                compressor.finish_current_chunk()
+            compressor.compress_many(np.frombuffer(record.array, np.uint8))
+        compressor.done()
+        file.seek(header.offset_to_point_data)
+        page, at = b"", header.offset_to_point_data + 8
+        for level, (n_points, n_bytes) in enumerate(lazrs.read_chunk_table(file, laz)):
+            page += struct.pack("<4iQ2i", level, 0, 0, 0, at, n_bytes, n_points)
+            at += n_bytes
+        header.start_of_first_evlr, header.number_of_evlrs = file.seek(0, os.SEEK_END), 1
+        file.write(struct.pack("<H16sHQ32s", 0, b"copc", 1000, len(page), b"") + page)
+        info = *middle, float(np.abs(points - middle).max()), 1.0, header.start_of_first_evlr + 60, len(page), 0.0, 0.0
+        header.vlrs[0].record_data = struct.pack("<5d2Q2d88x", *info)
+        file.seek(0)
+        header.write_to(file, ensure_same_size=True)
+    return path
+
+
 def write_kitti(folder: Path, made: Drive) -> Path:
     """Write scans in the layout of SemanticKITTI: poses of a camera, and calib.txt with the lidar's place on it."""
     (folder / "velodyne").mkdir(parents=True)
@@ -147,6 +188,18 @@ def write_e57(path: Path, made: Drive) -> Path:
             x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
             data = {f"cartesian{axis}": points[:, k].copy() for k, axis in enumerate("XYZ")}
             file.write_scan_raw(data, rotation=np.array([w, x, y, z]), translation=pose[:3, 3].copy())
+    return path
+
+
+def write_merged_e57(path: Path, points: Float64Array) -> Path:
+    """Write one cloud without a pose, as software that merges the stations of a survey does."""
+    import pye57  # noqa: PLC0415
+
+    bounds = {f"{axis}{end}imum": each for end, row in (("Min", points.min(axis=0)), ("Max", points.max(axis=0)))
+              for axis, each in zip("xyz", row, strict=True)}  # fmt: skip
+    head = SimpleNamespace(rotation=None, translation=None, **bounds)
+    with pye57.E57(str(path), mode="w") as file:
+        file.write_scan_raw({f"cartesian{axis}": points[:, k].copy() for k, axis in enumerate("XYZ")}, scan_header=head)
     return path
 
 

@@ -48,6 +48,15 @@ def test_bags(tmp_path: Path, name: str, poses: str) -> None:
     assert worst_m(path) < 1e-3
 
 
+def test_a_bag_is_looked_through_with_its_progress(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "a.bag", drive(n_scans=120, n_points=40))
+    told: list[tuple[str, int, int]] = []
+    source = open_session(path, report=lambda *step: told.append(step))
+    assert [done for name, done, total in told if name == "look through" and total == 120] == [0, 50, 100, 120, 120]
+    assert told[-1] == ("write", 120, 120)
+    np.testing.assert_allclose(np.diff(source.stamps_s), 0.1, atol=1e-6)
+
+
 def test_a_lone_db3_is_a_bag(tmp_path: Path) -> None:
     shutil.copy(next(write_bag(tmp_path / "ros2", MADE).glob("*.db3")), tmp_path / "lone.db3")
     assert worst_m(tmp_path / "lone.db3") < 1e-3

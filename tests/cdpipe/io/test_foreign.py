@@ -19,6 +19,8 @@ from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.io.foreign import HowToRead, convert_recording, folder_of_options, guess_format
 from cdpipe.io.foreign.clouds import point_times, stamps_of_names
 from cdpipe.io.foreign.points_files import read_e57
+from cdpipe.io.out.kitti import write_kitti as write_kitti_out
+from cdpipe.io.out.scans import Outgoing
 from cdpipe.io.ply import read_ply
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.session_check import check_session
@@ -32,9 +34,11 @@ from tests.cdpipe.io.foreign_files import (
     said,
     worst_m,
     write_bag,
+    write_copc,
     write_e57,
     write_kitti,
     write_lases,
+    write_merged_e57,
     write_pcds,
     write_trajectory,
 )
@@ -56,6 +60,18 @@ def test_laz_scans_with_gps_times(tmp_path: Path) -> None:
     assert worst_m(folder) < 0.01
 
 
+def test_copc_scans(tmp_path: Path) -> None:
+    laspy = pytest.importorskip("laspy")
+    for index, (points, _) in enumerate(STANDING.clouds):
+        path = write_copc(tmp_path / f"{index:06d}.copc.laz", points)
+        with laspy.CopcReader.open(path) as whole, laspy.CopcReader.open(path) as top:
+            assert len(whole.query()) == len(points) > len(top.query(level=0)) > len(points) / 2
+    write_trajectory(tmp_path / "t.tum", STANDING.stamps_s)
+    assert worst_m(tmp_path) < 2e-4
+    for scan, (points, _) in zip(open_session(tmp_path).scans(), STANDING.clouds, strict=True):
+        np.testing.assert_allclose(np.sort(scan.points_sensor, axis=0), np.sort(points, axis=0), atol=6e-5)
+
+
 def test_semantic_kitti(tmp_path: Path) -> None:
     folder = write_kitti(tmp_path / "00", STANDING)
     assert worst_m(folder) < 1e-4
@@ -70,6 +86,34 @@ def test_semantic_kitti(tmp_path: Path) -> None:
 def test_e57_has_the_poses_of_its_scanner(tmp_path: Path) -> None:
     pytest.importorskip("pye57")
     assert worst_m(write_e57(tmp_path / "a.e57", STANDING)) < 1e-4
+
+
+def test_a_folder_of_e57_stations_has_the_poses_of_its_scanners(tmp_path: Path) -> None:
+    pytest.importorskip("pye57")
+    for number in range(6):
+        station = Drive(STANDING.stamps_s[number : number + 1], STANDING.clouds[number : number + 1])
+        write_e57(tmp_path / f"station {number + 7}.e57", station)  # 7 to 12, without leading zeros
+    assert guess_format(tmp_path) == "e57"
+    assert worst_m(tmp_path) < 1e-4
+    poses = write_trajectory(tmp_path / "t.tum", STANDING.stamps_s)
+    assert "numbered without leading zeros" in said(tmp_path, HowToRead(trajectory=poses))
+    write_pcds(tmp_path, STANDING)
+    assert "several formats (6 pcd, 6 e57): name one, --format pcd or e57" in said(tmp_path)
+
+
+def test_a_merged_e57_without_a_pose_is_a_whole_map(tmp_path: Path) -> None:
+    pytest.importorskip("pye57")
+    points = np.random.default_rng(3).uniform((0, -2, 0), (24, 2, 0), (20_000, 3))
+    path = write_merged_e57(tmp_path / "a.e57", np.concatenate([points, points + np.array((0, 0, 3))]))
+    source = open_session(path, HowToRead(origin_m=(100.0, 0.0, 0.0)))
+    assert source.is_whole_map and len(source.odom_T_sensor) > 3
+    read = np.concatenate([scan.points_sensor + scan.odom_T_sensor[:3, 3] for scan in source.scans()])
+    assert len(read) == 40_000 and -100 <= read[:, 0].min() < -99 and -77 < read[:, 0].max() <= -76
+    with pytest.raises(InputError, match=r"a\.e57: a map without its scans has no poses or times: name a new \.laz"):
+        write_kitti_out(tmp_path, Outgoing(source), (), lambda *_: None)
+    assert len(list(tmp_path.iterdir())) == 1
+    poses = write_trajectory(tmp_path / "t.tum", STANDING.stamps_s[:1])
+    assert len(list(open_session(path, HowToRead(trajectory=poses)).scans())) == 1  # somebody says that it is a scan
 
 
 def test_an_e57_in_spherical_coordinates_with_intensities(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,11 +20,13 @@ from cdpipe.io.ply import write_ply_points
 from cdpipe.io.readers import RecordedScans, open_session
 from cdpipe.io.session import read_session
 from cdpipe.pipeline import detect
+from cdpipe.training.shard import read_shard
 from eval.graft import making
 from eval.graft.adapters import list_adapters, locate_recording
 from eval.graft.clouds import as_session
 from eval.graft.making import make_pair
 from eval.scoring import score
+from eval.training import Recipe, make_shard
 from scenarios.grafted import GraftScenario, Recording
 from scenarios.library import load_scenario
 from scenarios.schema import Prop, Scenario
@@ -242,3 +244,22 @@ def test_a_clock_that_begins_at_0_tells_no_time(simulated: Path) -> None:
         outgoing = Outgoing(RecordedScans(replace(session, provenance=given)))
         assert next(outgoing.sweeps(lambda *_: None)).stamp_ns == first_ns + told
         assert outgoing.start_ns == (told if start_ns is None else start_ns)
+
+
+def test_a_shard_of_a_dataset_is_made_of_a_recording(simulated: Path, tmp_path: Path) -> None:
+    own = tmp_path / "own.yaml"
+    own.write_text(
+        f"recording: {{sessions: [{simulated / 'before'}], reach_m: 4, clearance_m: 0.5}}\n"
+        "props:\n  - {name: box, kind: box, size_m: [0.8, 0.6, 0.7], change: added}\n"
+    )
+    (tmp_path / "one.safetensors").write_bytes(make_shard(str(own), SEED, Recipe(draws=1)))
+    arrays, about = read_shard(tmp_path / "one.safetensors")
+    assert about["is_recorded"]
+    assert about["changes"] == [{"name": "box", "prop_kind": "box"}]
+    assert arrays["change_is_observable"].tolist() == [True]
+    n_scans = read_session(simulated / "before").n_scans
+    assert arrays["before_scans"].max() < n_scans / 2  # every other revolution is of the after session
+    assert len(arrays["before_images"]) == about["counts"]["n_before"] > 0
+    assert len(arrays["after_scans"]) == about["counts"]["n_after"] > 0
+    assert about["counts"]["n_positive"] > 0
+    assert set(np.unique(arrays["labels"])) == {-1, 0, 1}

@@ -139,6 +139,16 @@ def test_scaled_turned_and_roofless_meshes_are_noticed(tube: Callable[..., trime
     assert "no inside" in refusal(saved(sheet, "sheet.stl"))
 
 
+def test_a_mesh_in_the_coordinates_of_a_country_is_refused_before_the_long_work(
+    tube: Callable[..., trimesh.Trimesh], saved: Save
+) -> None:
+    solid, steps = tube(), set()
+    solid.apply_translation((432_000.0, 5_411_000.0, 310.0))
+    with pytest.raises(ScenarioError, match=r"lies 5411 km from the origin.*subtract \(432000, 5411000, 300\) m"):
+        trace_mesh(MeshFile(path=saved(solid, "utm.obj")), on_progress=lambda step, *_: steps.add(step))
+    assert steps == {"read the mesh"}
+
+
 def test_refusals_of_odd_widths_tell_a_way_out(tube: Callable[..., trimesh.Trimesh], saved: Save) -> None:
     tenth, slim = tube(), tube()
     tenth.apply_scale(0.1)

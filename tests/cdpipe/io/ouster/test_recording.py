@@ -189,6 +189,27 @@ def test_an_origin_is_subtracted_and_no_deskewing_is_told(tmp_path: Path) -> Non
     )
 
 
+def test_quaternions_with_w_first_are_refused_and_nothing_stays(tmp_path: Path) -> None:
+    def world_T_sensor(time_s: float) -> Float64Array:
+        return yaw_pose(2.0 * time_s, (time_s - 2.0, 0.3, 0.1))
+
+    info = info_of(SENSOR)
+    made = frames(info, 8, lambda _: np.eye(4))
+    in_a_room(made, world_T_sensor)
+    made[3].field("RANGE")[:] = 0  # nothing came back
+    path = write_frames(tmp_path / "r.osf", info, made)
+    time_s = np.arange(-0.05, 0.9, 0.01)
+    poses = np.stack([world_T_sensor(each) for each in time_s])
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    for name, order in (("right", turns), ("w_first", np.roll(turns, 1, axis=1))):
+        rows = np.column_stack([START_NS / 1e9 + time_s, poses[:, :3, 3], order])
+        np.savetxt(tmp_path / f"{name}.tum", rows, fmt="%.9f")
+    told = said(lambda: import_recording(path, tmp_path / "s", trajectory=tmp_path / "w_first.tum"))
+    assert told.startswith(f"{tmp_path / 'w_first.tum'}: the scans lie ") and "they look like qw first" in told
+    assert left(tmp_path) == ["r.osf", "right.tum", "w_first.tum"]
+    assert import_recording(path, tmp_path / "s", trajectory=tmp_path / "right.tum").n_scans == 8
+
+
 def test_a_pose_per_revolution_at_its_first_column_is_enough(tmp_path: Path) -> None:
     info = info_of(SENSOR)
     path = write_frames(tmp_path / "r.osf", info, frames(info, 3))
