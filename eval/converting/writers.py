@@ -138,6 +138,7 @@ def write_kitti_poses(request: Request, path: Path) -> None:
     from cdpipe.io.out.poses import write_kitti_poses as write
     from sim.session.truth import read_true_poses
 
+    Outgoing(request.source).require_scans()
     write(path, request.source.odom_T_sensor)
     if request.with_truth:
         write(path.with_suffix(".true.kitti"), read_true_poses(request.own_session().path))

@@ -26,7 +26,7 @@ from eval.converting.truth import truth_fields
 from scenarios import load_scenario
 from sim.rock.glb import count_glb
 from sim.session.truth import read_pair_truth, read_true_poses
-from tests.cdpipe.io.foreign_files import drive, write_trajectory
+from tests.cdpipe.io.foreign_files import drive, write_merged_e57, write_trajectory
 from tests.cdpipe.io.test_whole_map import drift
 
 Result = tuple[int, str, str]
@@ -417,6 +417,14 @@ def test_a_map_without_scans_leaves_as_a_map_alone(tmp_path: Path, command: Comm
     assert list(scalars) == ["intensity"]
     assert len(found) > 0.9 * len(points)
     np.testing.assert_allclose(found, points[scalars["intensity"].astype(int)], atol=1e-4)
+
+
+def test_a_merged_e57_has_no_poses_to_write(tmp_path: Path, command: Command) -> None:
+    pytest.importorskip("pye57", reason="pip install 'tunnelcd[formats]'")
+    source = write_merged_e57(tmp_path / "b.e57", drift(1).astype(np.float64))
+    for name in ("w.kitti", "w.tum"):
+        refused(command("convert", source, tmp_path / name), f"{source}: a map without its scans has no poses or times")
+    assert [path.name for path in tmp_path.iterdir()] == ["b.e57"]
 
 
 def test_a_session_far_out_is_no_pcd(
