@@ -274,3 +274,17 @@ def test_a_bent_scan_does_not_tell_of_its_mist_either(tunnel: CloudScans) -> Non
         assert len(bent.points_sensor) == 0 and bent.airborne_sensor is None
         assert len(kept.points_sensor) == len(clouds[1])
         np.testing.assert_array_equal(kept.airborne_sensor, [[2.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_path_is_tipped_by_its_first_scan_alone(tunnel: CloudScans, seed: int) -> None:
+    # jitter tips single scans by up to a degree; the frame is that of the first scan, and over the way nothing is added
+    true, noisy = tunnel.odom_T_sensor, jittered(tunnel, seed)
+
+    def tilts_deg(poses: Float64Array) -> Float64Array:
+        poses = true[0] @ invert(poses[0]) @ poses
+        up = np.einsum("sk,sk->s", poses[:, 2, :3], true[:, 2, :3])
+        return np.asarray(np.rad2deg(np.arccos(np.clip(up, -1.0, 1.0))))
+
+    recorded, found = tilts_deg(noisy.odom_T_sensor), tilts_deg(make_consistent(noisy).odom_T_sensor)
+    assert recorded.max() > 0.8 > 8 * found.max()
