@@ -19,12 +19,15 @@ from cdpipe.core.threads import THREAD_VARIABLES
 
 TOOL = "tunnelcd"
 FORMAT_VERSION = 1
+# Rows depend on these, but for `distributed`, of which a cluster needs one: runs that differ in them are not mixed.
 _PACKAGES = (
     "tunnelcd", "numpy", "scipy", "pandas", "torch", "mujoco", "embreex", "trimesh", "small_gicp", "kiss-matcher",
     "py4dgeo", "dufomap", "pyoctomap", "kiss-icp", "warp-lang", "scikit-image", "pydantic", "matplotlib", "distributed",
 )  # fmt: skip
-# No result depends on these extras.
-_OTHER_PACKAGES = ("ouster-sdk", "viser")
+# Rows of worlds that are recordings depend on these too: they read the recordings, or estimate their poses.
+_OF_RECORDINGS = ("genz-icp", "ouster-sdk", "pypcd4", "laspy", "lazrs", "pye57", "rosbags")
+# No row depends on these: they show, convert to other formats and store; `distributed` stands for dask.
+IDLE = ("viser", "rerun-sdk", "mcap", "pyarrow", "mlcroissant", "dask")
 
 
 def digest(value: Any) -> str:
@@ -59,7 +62,11 @@ def machine() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that results depend on; "absent" where not installed."""
-    return {"python": platform.python_version(), **{name: extra_version(name) for name in _PACKAGES}}
+    return {"python": platform.python_version(), **_versions_of((*_PACKAGES, *_OF_RECORDINGS))}
+
+
+def _versions_of(packages: Sequence[str]) -> dict[str, str]:
+    return {name: extra_version(name) for name in packages}
 
 
 def describe_run(
@@ -91,7 +98,8 @@ def describe_run(
         "seeds": list(plan["seeds"]),
         "config_digests": {name: digest(config) for name, config in configs.items()},
         "checkpoints": dict(checkpoints),
-        "versions": {**versions(), **{name: extra_version(name) for name in _OTHER_PACKAGES}},
+        "versions": {"python": platform.python_version(), **_versions_of(_PACKAGES)},
+        "extras": _versions_of((*_OF_RECORDINGS, *IDLE)),
         "git_commit": commit,
         "machine": machine(),
     }

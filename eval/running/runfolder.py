@@ -63,7 +63,7 @@ from eval.tables.surface.table import surface_tables
 
 # What provenance.json says of the run that made the cells; plan, settings and checkpoints are those of the last run.
 _OF_THE_START = ("started", "finished", "command", "machine")
-_OF_THE_MAKING = (*_OF_THE_START, "git_commit", "versions", "parts")
+_OF_THE_MAKING = (*_OF_THE_START, "git_commit", "versions", "extras", "parts")
 NEW_TABLES = ".tables.partial"  # in the run folder, while tables are written
 _MAP_CELL_M = 0.1  # pictures number no smaller cells
 _MAPS = {"before_points": ArraySpec("N,3", "float32"), "after_points": ArraySpec("M,3", "float32")}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import random
+import shlex
 import shutil
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import yaml
 
+from eval.leaderboard.templates import write_template
 from tests.soak.command import Command
 from tests.soak.comparing import Found, compare_files, compare_runs
 from tests.soak.disturbers import Disturber, OneMachine, OwnCluster
@@ -23,6 +25,12 @@ from tests.trust.contents import find_damaged
 
 _SMALL = ("sensor.mode=512x10", "platform.scan_spacing_m=1.0")  # a quarter of the returns
 _WORLD = " ".join(f"--world {setting}" for setting in _SMALL)
+_METHOD = f"{shlex.quote(sys.executable)} given/method.py {{before}} {{after}} {{out}} {{merge}}"
+_RELEASE = """description: d
+published: 2026-11-26
+settings: [sensor.mode=512x10, platform.scan_spacing_m=1.0]
+pairs: {smoke/one_box: "20000:20001"}
+"""
 _MOST_STARTS = 40  # of one run or command; then it counts as one that never ends
 
 
@@ -94,7 +102,7 @@ class Written:
 
     @property
     def argv(self) -> list[str]:
-        return [*self.words.split(), *([] if self.words.startswith("report") else ["--quiet"])]
+        return [*shlex.split(self.words), *([] if self.words.startswith("report") else ["--quiet"])]
 
 
 COMMANDS: Mapping[str, Written] = {
@@ -109,6 +117,10 @@ COMMANDS: Mapping[str, Written] = {
     "train 3deg": Written(
         "train data --descriptor 3deg --steps 2 --threads 1 --out weights", "weights", {"data": "dataset/data"}
     ),
+    "train range-net": Written(
+        "train data --descriptor range-net --steps 2 --threads 1 --out weights", "weights", {"data": "dataset/data"}
+    ),
+    "release": Written("dataset --release given/r.yaml --out release/r.zip", "release", {"given": "given"}),
     "simulate a story": Written(
         f"simulate smoke/one_box --sessions 3 --seed 20000 {_WORLD} --out story", "story", is_once=True
     ),
@@ -116,6 +128,18 @@ COMMANDS: Mapping[str, Written] = {
     "story": Written("story story --out page", "page", {"story": "simulate a story/story"}),
     "graft": Written("graft pair/before --out grafted", "grafted", {"pair": "simulate/pair"}, is_once=True),
     "export": Written("export run --with-truth --out copy", "copy", {"run": "run/run"}),
+    "blind export": Written("export run --out copy", "copy", {"run": "run/run"}),
+    "merge-runs": Written("merge-runs a b --out union", "union", {"a": "run/run", "b": "run/run"}, is_once=True),
+    # the tables beside the answers hold times
+    "evaluate": Written(
+        f"evaluate --plan given/plan.yaml --command {shlex.quote(_METHOD)} --merge given --as mine --out bench",
+        "bench/answers",
+        {"given": "given"},
+    ),
+    "submit": Written("submit bench --out zip/mine.zip", "zip", {"bench": "evaluate/bench"}),
+    "leaderboard": Written("leaderboard zip/mine.zip --out board/index.html", "board", {"zip": "submit/zip"}),
+    "world as GLB": Written("convert smoke/one_box mesh/w.glb --seed 20000", "mesh"),
+    "trace": Written("trace mesh/w.glb --units m --up y --out traced/w.yaml", "traced", {"mesh": "world as GLB/mesh"}),
     "report": Written("report run", "run", {"run": "run/run"}),
     "score a run": Written("score run", "run", {"run": "run/run"}),
     "score predictions": Written(
@@ -142,6 +166,10 @@ class Soak:
         self.usual.mkdir(parents=True)
         self.plan = self.folder / "plan.yaml"
         self.plan.write_text(size.plan())
+        (self.usual / "given").mkdir()
+        (self.usual / "given" / "plan.yaml").write_text(Size(["smoke/one_box"], 1).plan())
+        (self.usual / "given" / "r.yaml").write_text(_RELEASE)
+        write_template(self.usual / "given" / "method.py", "given")
         self._took_s: dict[str, float] = {}
         self._n_rounds = 0
         self._began = time.monotonic()
@@ -157,13 +185,14 @@ class Soak:
         return all(sum(asdict(tally).values()) == tally.times > 0 for tally in self.tallies.values())
 
     def run_undisturbed(self) -> None:
-        """Run the plan, and write its page."""
+        """Run the plan, draw the names of its blind copies, and write its page."""
         folder = self.usual / "run"
         folder.mkdir()
         self._must(folder, "list")  # imports
         start = time.monotonic()
         self._must(folder, "run", self.plan, "--out", "run", "--quiet")
         self._took_s["run"] = time.monotonic() - start
+        self._must(folder, "export", "run", "--out", "named", "--quiet")
         self._write_page(folder)
         self.tell(f"undisturbed: {self.size.n_cells} cells in {self._took_s['run']:.1f} s")
 

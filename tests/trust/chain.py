@@ -37,6 +37,7 @@ def run_chain(scenario: str) -> None:
     tunnelcd("dataset", scenario, "--seeds", "9999:10001", "--draws", "1", "--out", "data", "--quiet")
     tunnelcd("train", "data", "--out", "sphere", "--steps", "2", "--threads", "1", "--quiet")
     tunnelcd("train", "data", "--out", "place", "--descriptor", "3deg", "--steps", "1", "--quiet")
+    tunnelcd("train", "data", "--out", "net", "--descriptor", "range-net", "--steps", "1", "--threads", "1", "--quiet")
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from cdpipe.io.readers import open_session
 from cdpipe.model.config import load_config
 from eval.cli.listing import list_entries
 from eval.core.tablefile import read_table
+from eval.core.terminal.progress import Silent
 from eval.leaderboard.calls import describe_calls, evaluation_folder, read_evaluation
 from eval.leaderboard.packing import pack_submission
 from eval.leaderboard.reference import find_reference
@@ -36,11 +37,13 @@ from eval.report.framing.kept import read_kept
 from eval.running.runfolder import open_run_folder, write_json
 from eval.running.scaling.merging import merge_runs
 from eval.running.scaling.mirror import Mirror
+from eval.stories.comparisons import Method, run_comparisons
 from eval.studies.bench_tables import main as write_bench_tables
 from scenarios.library import check_scenario, load_grafted, load_scenario
 from scenarios.references import file_digests
 from scenarios.schema import MeshFile
 from sim.trace import draft_scenario, trace_mesh
+from tests.eval.conftest import write_pair
 from tests.eval.leaderboard.conftest import Evaluator
 
 _ROOT = Path(__file__).parents[2]
@@ -243,6 +246,20 @@ def make_parquet(folder: Path) -> None:
 def read_parquet_table(folder: Path) -> None:
     """Read it."""
     read_table(folder / "t.parquet")
+
+
+def make_comparisons(folder: Path) -> None:
+    """Write a story of two sessions, and compare them."""
+    write_pair(folder / "pair")
+    (folder / "story").mkdir()
+    for number, name in enumerate(("before", "after"), 1):
+        (folder / "pair" / name).rename(folder / "story" / f"session-0{number}")
+    read_comparisons(folder)
+
+
+def read_comparisons(folder: Path) -> None:
+    """Go on with the comparisons."""
+    run_comparisons(folder / "story", folder / "out", Method("voxel-diff", "narrow", ()), Silent())
 
 
 def make_release_content(folder: Path) -> None:

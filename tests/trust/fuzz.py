@@ -9,7 +9,8 @@ An input is one damaged file in a reader's example folder; it follows from (seed
 - `over memory`: the process grew by more than 500 MB plus ten times the folder;
 - `death`: the process ended.
 
-Every input with another outcome than the first two is kept: `--replay FOLDER/KEPT` reads it again.
+Every input with another outcome than the first two is kept: `--replay FOLDER/KEPT` reads it again. A reader that read
+none of 50 inputs or more fails too: the damage of its files does not reach it.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ OUTCOMES = ("read", "one line", "several lines", "traceback", "over 10 s", "over
 DEFECTS = OUTCOMES[2:]
 MOST_S, SILENT_S = 10.0, 60.0
 MOST_BYTES, MOST_TIMES = 500 << 20, 10
+_MANY = 50
 # A process that has grown by this much is replaced, so that the growth of later inputs is seen.
 _RESTART_BYTES = 150 << 20
 # Beyond this an allocation fails, so that one input cannot take the machine down.
@@ -364,8 +366,13 @@ def add_up(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return total
 
 
+def list_unread(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the readers that read none of many inputs."""
+    return [row["reader"] for row in rows if row["inputs"] >= _MANY and not row["read"]]
+
+
 def main() -> None:
-    """Run the program; it exits with 1 if an input had an outcome that it should not have."""
+    """Run the program; it exits with 1 if an input had a wrong outcome, or a reader read none."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--inputs", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
@@ -384,14 +391,16 @@ def main() -> None:
         return
     started = time.monotonic()
     rows = fuzz(asked.keep.resolve(), asked.inputs, asked.seed, asked.processes, asked.only)
+    unread = list_unread(rows)
     rows.append(add_up(rows))
     about = f"Seed {asked.seed}, {asked.processes} processes, {(time.monotonic() - started) / 60:.0f} min."
+    about += f" **Not one input was read: {', '.join(unread)}.**" if unread else ""
     if asked.out:
         write_table(asked.out, rows, about)
     for row in rows:
         print(" | ".join(str(value) for value in row.values()))
     print(" | ".join(rows[0]), about, sep="\n")
-    raise SystemExit(any(rows[-1][outcome] for outcome in DEFECTS))
+    raise SystemExit(bool(unread) or any(rows[-1][outcome] for outcome in DEFECTS))
 
 
 if __name__ == "__main__":

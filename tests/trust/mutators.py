@@ -290,21 +290,7 @@ def change_npy_header(content: bytes, rng: random.Random) -> bytes:
     kind = rng.randrange(5)
     if kind == 0:
         header["shape"] = rng.choice(
-            (
-                (),
-                (0,),
-                (-1,),
-                (1 << 62,),
-                (10**30,),
-                (1 << 31, 1 << 31),
-                (3,),
-                (1,) * 40,
-                (1.5,),
-                ("3",),
-                [3],
-                None,
-                (1000,),
-            )
+            ((), (0,), (-1,), (1 << 62,), (10**30,), (1 << 31,) * 2, (3,), (1,) * 40, (1.5,), ("3",), [3], None, (9,))
         )
     elif kind == 1:
         header["descr"] = rng.choice(
@@ -384,18 +370,7 @@ def change_safetensors(content: bytes, rng: random.Random) -> bytes:
         tensor[key] = rng.choice(
             {
                 "dtype": ("F64", "F32", "F16", "BF16", "I64", "U8", "BOOL", "X", "", None, "F8_E4M3", "I8"),
-                "shape": (
-                    [],
-                    [0],
-                    [1 << 62],
-                    [1 << 32, 1 << 32],
-                    [-1],
-                    [1],
-                    None,
-                    [1.5],
-                    tensor["shape"][::-1],
-                    [2] * 70,
-                ),
+                "shape": ([], [0], [1 << 62], [1 << 32] * 2, [-1], [1], None, [1.5], tensor["shape"][::-1], [2] * 70),
                 "data_offsets": ([0, 0], [0, 1 << 62], [8, 0], [-1, 4], [0], None, [0, len(body)]),
             }[key]
         )
@@ -426,6 +401,49 @@ def change_ply_header(content: bytes, rng: random.Random) -> bytes:
     else:
         return change_lines(head, rng) + rest
     return head + rest
+
+
+def within(mutator: Mutator, first: int, last: int | None = None) -> Mutator:
+    """Return a mutator of one part of a file, from byte `first` to byte `last`, as slices count."""
+
+    def damage(content: bytes, rng: random.Random) -> bytes:
+        start, end, _ = slice(first, last).indices(len(content))
+        return content[:start] + mutator(content[start:end], rng) + content[max(start, end) :]
+
+    return damage
+
+
+def change_glb(content: bytes, rng: random.Random) -> bytes:
+    """Change the JSON of a GLB file, and mend its lengths."""
+    end = 20 + struct.unpack_from("<I", content, 12)[0]
+    text = change_json(content[20:end], rng)
+    text += b" " * (-len(text) % 4)
+    lengths = struct.pack("<II", len(content) - end + 20 + len(text), len(text))
+    return content[:8] + lengths + content[16:20] + text + content[end:]
+
+
+def change_e57(content: bytes, rng: random.Random) -> bytes:
+    """Change bytes of an E57 file or the text of its XML, and mend its lengths and the checksums of its pages."""
+    data = b"".join(content[at : at + 1020] for at in range(0, len(content), 1024))
+    if rng.random() < 0.4:
+        data = rng.choice((flip, overwrite))(data, rng)[: len(data)]
+    else:
+        start, n_bytes = data.index(b"<?xml"), struct.unpack_from("<Q", data, 32)[0]
+        text = rng.choice((replace_number, replace_number, change_lines, flip))(data[start : start + n_bytes], rng)
+        data = data[:32] + struct.pack("<Q", len(text)) + data[40:start] + text
+        data += bytes(-len(data) % 1020)
+        data = data[:16] + struct.pack("<Q", len(data) // 1020 * 1024) + data[24:]
+    pages = (data[at : at + 1020] for at in range(0, len(data), 1020))
+    return b"".join(page + _crc32c(page).to_bytes(4, "big") for page in pages)
+
+
+def _crc32c(data: bytes) -> int:
+    found = 0xFFFFFFFF
+    for byte in data:
+        found ^= byte
+        for _ in range(8):
+            found = found >> 1 ^ 0x82F63B78 * (found & 1)
+    return found ^ 0xFFFFFFFF
 
 
 def change_osf(content: bytes, rng: random.Random) -> bytes:
@@ -594,6 +612,12 @@ _BY_SUFFIX: dict[str, tuple[Mutator, ...]] = {
     "safetensors": (change_safetensors,),
     "osf": (change_osf,),
     "pcap": (change_pcap,),
-    "bag": (change_bag, change_bag, flip, overwrite),
-    "db3": (change_bag, change_bag, flip, overwrite),
+    **dict.fromkeys(("bag", "db3", "mcap"), (change_bag, change_bag, flip, overwrite)),
+    "e57": (change_e57,),
+    "zip": (change_zip, change_members),
+    "glb": (change_glb,),
+    "stl": (within(overwrite, 80, 184), replace_number),
+    "pcd": (within(replace_number, 0, 200), within(change_lines, 0, 200)),
+    "laz": (within(flip, 0, 375), within(overwrite, 0, 375)),
+    "parquet": (flip, within(flip, -2000)),
 }

@@ -12,7 +12,7 @@ import shutil
 import struct
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,7 @@ from eval.running.rescoring import foreign_identity
 from eval.running.results.run_data import read_run
 from eval.running.results.sides import read_side
 from eval.running.runfolder import RunFolder, open_run_folder, write_json, write_tables
+from eval.running.scaling.keeping import Dropped, dropped_file, list_dropped, read_dropped
 from eval.running.stages.stage_cache import Kept, StageCache
 from eval.scoring.scoring import score_stored
 from eval.studies.calibrate import read_table
@@ -64,9 +65,18 @@ from scenarios.library import load_scenario
 from scenarios.schema import MeshFile
 from sim.placement.recorded import read_drive
 from sim.rock.foreign import prop_mesh, tunnel_mesh
-from sim.session.truth import read_labels
+from sim.session.truth import (
+    MoverTrack,
+    MoverTruth,
+    SurfaceChangeTruth,
+    read_labels,
+    read_pair_truth,
+    write_mover_track,
+    write_pair_truth,
+    write_surface_labels,
+)
 from sim.story.state import SessionState, Story, dump_story, read_story
-from tests.eval.conftest import ODOM_T_WORLD, WIDTH, write_pair
+from tests.eval.conftest import N_SCANS, ODOM_T_WORLD, WIDTH, write_pair
 from tests.eval.leaderboard.conftest import Evaluator
 from tests.trust import examples
 
@@ -149,7 +159,7 @@ def _answer(folder: Path, *, by_returns: bool = False) -> None:
     points = np.random.default_rng(2).normal(0, 1, (20, 3))
     document = {
         "format": "tunnelcd-answer", "format_version": 1, "status": "ok", "error": "", "method": "mine",
-        "before_T_after": merge.tolist(), "radius_m": 4.5,
+        "before_T_after": merge.tolist(), **({"radius_m": 4.5} if by_returns else {}),
         "seconds": {"t_merge_s": 0.1, "t_cd_s": 0.2, "t_oe_s": 0.0, "t_descriptor_s": 0.0},
         "evidence": {"overlap": 0.9}, "config": {"a": {"b": 1}},
         "objects": [
@@ -157,11 +167,12 @@ def _answer(folder: Path, *, by_returns: bool = False) -> None:
             {"session": "before", "kind": "moved", "partner": 0, "displacement_map": [1.0, 0.0, 0.0],
              "shape": {"map_T_box": np.eye(4).tolist(), "box_m": [1.0, 1.0, 1.0], "volume_m3": 1.0}},
         ],
+        "surface_regions": [{"centre_map": [0.0] * 3, "area_m2": 2, "volume_m3": 1, "mean_m": 0.1, "largest_m": 0.1}],
     }  # fmt: skip
     (folder / "answer.json").write_text(json.dumps(document, indent=1))
     offsets = np.array([0, 12, 20])
     objects = {"object_points_odom": points, "object_point_odom_offsets": offsets}
-    objects |= {"object_points_map": points, "object_point_offsets": offsets}
+    objects |= {"object_points_map": points, "object_point_offsets": offsets, "region_radii_m": np.full(3, 4.5)}
     if by_returns:
         returns = [[scan, WIDTH + 4 + n] for scan in (2, 3) for n in range(6)] + [[9, WIDTH + 30 + n] for n in range(8)]
         objects = {"object_returns": np.array(returns, np.int32), "object_return_offsets": offsets}
@@ -172,22 +183,43 @@ def _answer(folder: Path, *, by_returns: bool = False) -> None:
         region_is_reported=np.array([True, False, False]),
         region_is_withdrawn=np.array([False, True, False]),
         region_is_forced=np.array([False, False, True]),
+        region_pairs=np.eye(3, 2, dtype=int),
+        region_direction=np.array([0, 1, 0], np.uint8),
+        region_proposed_centres_map=points[3:6],
         **objects,
         before_keyframe_scans=np.arange(0, 14, 2),
         after_keyframe_scans=np.arange(0, 14, 2),
         keyframe_scores=np.linspace(0, 1, 7),
         local_before_T_after=np.tile(merge, (7, 1, 1)),
         figure_x=np.zeros(3),
+        surface_points_map=points,
+        surface_normals_map=np.eye(3)[np.arange(20) % 3],
+        surface_region=np.arange(20) % 3 // 2 - 1,
+        **{f"surface_{name}": points[:, 0] for name in ("displacement_m", "chainage_m", "angle_deg")},
+        surface_level_m=np.full(20, 0.1),
     )
 
 
+def _pair(pair: Path) -> None:
+    """Write the tiny pair; in its truth something moves, and the rock moved."""
+    write_pair(pair)
+    rock = SurfaceChangeTruth(1, "sinks", "heave", None, 2.0, 0.2, 0.1, 0.1, [0.0] * 3)
+    mover = MoverTruth("man", "person", 9, "before", 2.0, 0.5, 10)
+    write_pair_truth(pair, replace(read_pair_truth(pair), movers=(mover,), surface_changes=(rock,)))
+    track = np.tile(np.eye(4), (1, N_SCANS, 1, 1)), np.ones((1, N_SCANS), np.int32), np.zeros((1, N_SCANS, 3))
+    write_mover_track(pair / "before", MoverTrack(*track))
+    for name in ("before", "after"):
+        for index, (_, change) in enumerate(read_labels(pair / name, 3)):
+            write_surface_labels(pair / name, index, np.full(change.shape, 0.1, np.float32), np.ones_like(change))
+
+
 def _scored(folder: Path) -> None:
-    write_pair(folder / "pair")
+    _pair(folder / "pair")
     _answer(folder / "answer", by_returns=True)
 
 
 def _truth(folder: Path) -> None:
-    write_pair(folder / "pair")
+    _pair(folder / "pair")
     load_ground_truth(folder / "pair")  # writes the caches of scoring points
 
 
@@ -359,11 +391,11 @@ def _run(folder: Path) -> None:
     run = RunFolder(folder / "run")
     pair = run.pair("test", 7)
     pair.parent.mkdir(parents=True)
-    write_pair(pair)
+    _pair(pair)
     plan = {
         "scenarios": [{"family": "test", "seeds": [7]}],
         "methods": ["voxel-diff"],
-        "report": ["regions", "objects"],
+        "report": ["regions", "objects", "surface"],
     }
     provenance = {"tool": "tunnelcd", "version": "0.1.0", "git_commit": "abc", "plan": plan, "command": ["run"]}
     write_json(run.path / "provenance.json", provenance | {"machine": {"cpu": "x"}, "packages": {"numpy": "2"}})
@@ -382,6 +414,8 @@ def _run(folder: Path) -> None:
     write_json(
         run.path / "blind.json", {"format": "tunnelcd-blind", "format_version": 1, "salt": "0" * 64, "pairs": {}}
     )
+    record = Dropped(world="test", seed=8, scenario={}, files={}, digest="0" * 16, n_bytes=1)
+    write_json(dropped_file(RunFolder(folder / "rows"), "test", 8), record.model_dump())
     for name in ("changes", "keyframes"):
         table = run.path / f"{name}.csv"
         table.with_name(f"{name}.csv.xz").write_bytes(lzma.compress(table.read_bytes(), preset=0))
@@ -389,6 +423,8 @@ def _run(folder: Path) -> None:
 
 
 def _read_cells(folder: Path) -> None:
+    for path in list_dropped(RunFolder(folder / "rows")):
+        read_dropped(path)
     write_tables(open_run_folder(folder / "run"))
     name_blindly(RunFolder(folder / "run"))
 
@@ -496,14 +532,14 @@ def _read_recording(folder: Path) -> None:
         pass
 
 
-def _foreign(write: str, suffix: str = "") -> Callable[[Path], object]:
+def _foreign(write: str, suffix: str = "", **options: Any) -> Callable[[Path], object]:
     """Return what writes a recording with somebody else's library."""
 
     def make(folder: Path) -> None:
         from tests.cdpipe.io import foreign_files  # noqa: PLC0415 - only where the extra is installed
 
         made = foreign_files.drive(3, 40)
-        getattr(foreign_files, write)(folder / f"r{suffix}", made)
+        getattr(foreign_files, write)(folder / f"r{suffix}", made, **options)
         if suffix == "":
             foreign_files.write_trajectory(folder / "r" / "poses.txt", made.stamps_s)
 
@@ -581,12 +617,13 @@ def _story(folder: Path) -> None:
 
 
 _SESSION = ("s/session.json", "s/odometry.npz", "s/chunks/00000.npz")
-_TRUTH = ("pair/truth/*", "pair/before/truth/*", "pair/*/session.json")
-_CELLS = ("run/cells/*/*/*.json", "run/provenance.json", "run/blind.json")
+_TRUTH = ("pair/truth/*", "pair/before/truth/*", "pair/before/truth/surface/*", "pair/*/session.json")
+_CELLS = ("run/cells/*/*/*.json", "run/provenance.json", "run/blind.json", "rows/*/*/*")
 _TABLES = ("run/results.csv", "run/*.csv.xz", "run/regions.csv", "run/provenance.json")
 _PAGE = ("run/*.csv", "run/*.csv.xz", "run/provenance.json", "run/maps/test/7.npz", "run/answers/*/*/*/*")
 _UNION = ("twin/cells/*/*/*.json", "twin/answers/*/*/*/*", "twin/provenance.json")
 _EVALUATED = ("run/evaluations/*/*.json", "run/evaluations/*/*/*.json", "run/cells/*/*/*.json", "run/results.csv")
+_STORY = ("out/*", "out/*/*/answer.*")
 _SHARDS = ("*.safetensors", "index.csv")
 # The shares follow the time that a reader takes: 0.5 ms to 3 s an input.
 READERS: tuple[Reader, ...] = (
@@ -596,6 +633,7 @@ READERS: tuple[Reader, ...] = (
     Reader("sensor metadata", _metadata, _read_metadata, ("*.json",), 1.5),
     Reader("truth of a pair", _truth, _read_truth, _TRUTH, 0.7, lines=True),
     Reader("story", _story, read_story, ("story.json",), 1.0, lines=True),
+    Reader("compared sessions", examples.make_comparisons, examples.read_comparisons, _STORY, 0.5, lines=True),
     Reader("answer", _answer, read_answer, ("answer.json", "answer.npz"), 4.0, lines=True),
     Reader("answer, scored", _scored, _read_scored, ("answer/*",), 1.5, lines=True),
     Reader("known merge", _merges, _read_merges, ("*",), 0.7, lines=True),
@@ -624,7 +662,7 @@ READERS: tuple[Reader, ...] = (
     Reader("E57", _foreign("write_e57", ".e57"), _read_foreign, ("r.e57",), 0.1, extra="pye57"),
     Reader("ROS 1 bag", _foreign("write_bag", ".bag"), _read_foreign, ("r.bag",), 0.1, extra="rosbags"),
     Reader("ROS 2 bag", _foreign("write_bag", "2"), _read_foreign, ("r2/*",), 0.1, extra="rosbags"),
-    Reader("MCAP", _foreign("write_bag", ".mcap"), _read_foreign, ("r.mcap",), 0.1, extra="mcap"),
+    Reader("MCAP", _foreign("write_bag", ".mcap", compression=None), _read_foreign, ("r.mcap",), 0.1, extra="mcap"),
     Reader("worlds that move", examples.make_worlds, examples.read_worlds, ("*.yaml",), 0.2, lines=True),
     Reader("props to graft", examples.make_objects, examples.read_objects, ("*.yaml",), 0.5, lines=True),
     Reader("files on the search path", examples.make_search_path, examples.read_search_path, ("*/*",), 0.3, lines=True),

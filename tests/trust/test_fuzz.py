@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import random
+import struct
 from pathlib import Path
 
 import pytest
 
-from tests.trust.fuzz import DEFECTS, Server, Tally, Watched, fuzz, make_examples, read_one, share_inputs
+from tests.trust.fuzz import DEFECTS, Server, Tally, Watched, fuzz, list_unread, make_examples, read_one, share_inputs
+from tests.trust.mutators import _crc32c, change_e57
 from tests.trust.readers import READERS
 
 N_INPUTS, SEED = 2000, 24
@@ -40,6 +43,18 @@ def test_inputs_that_nobody_reads_do_not_look_harmless(folder: Path, monkeypatch
     monkeypatch.setattr(Watched, "read", read)
     with pytest.raises(TimeoutError, match="did not start"):
         fuzz(folder, 1, SEED, 1, [name for name in NAMES if name not in SLOW][:1], quiet=True)
+
+
+def test_a_reader_that_reads_nothing_is_named() -> None:
+    rows = [("none", 50, 0), ("few", 49, 0), ("one", 50, 1)]
+    assert list_unread([dict(zip(("reader", "inputs", "read"), row, strict=True)) for row in rows]) == ["none"]
+
+
+def test_the_checksums_of_e57_are_mended() -> None:
+    assert _crc32c(b"123456789") == 0xE3069283
+    content = struct.pack("<8s2I4Q", b"ASTM-E57", 1, 0, 1024, 48, 8, 1024) + b"<?xml 1>"
+    made = change_e57(content, random.Random(0))
+    assert len(made) == 1024 and made[1020:] == _crc32c(made[:1020]).to_bytes(4, "big")
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cdpipe.core.errors import InputError
+from eval.core.provenance import IDLE
 
 _MUST_AGREE = ("format_version", "seeds", "plan", "plan_digest", "versions", "config_digests", "checkpoints")
 _WORDS = {
@@ -13,8 +14,8 @@ _WORDS = {
     "plan": "plans", "plan_digest": "plans", "format_version": "formats",
 }  # fmt: skip
 _TOLD = 4
-# No row depends on these.
-_IDLE_PACKAGES = ("ouster-sdk", "viser", "distributed")
+# No row depends on these; in a cluster all must be of one `distributed`.
+_IDLE_PACKAGES = (*IDLE, "distributed")
 
 
 def unite_provenance(
@@ -73,7 +74,9 @@ def _require_alike(
     name: str, first: Mapping[str, Any], other_name: str, other: Mapping[str, Any], keys: Sequence[str] = _MUST_AGREE
 ) -> None:
     for key in keys:
-        one, two = (_comparable(key, each) for each in (first, other))
+        one, two = first.get(key), other.get(key)
+        if key == "versions" and isinstance(one, Mapping) and isinstance(two, Mapping):
+            one, two = _shared(_packages(first), _packages(other))
         if one != two:
             raise InputError(
                 f"{name} and {other_name}: of different {_WORDS[key]} ({_name_difference(one, two)}): rows of both in "
@@ -87,11 +90,15 @@ def _require_alike(
         )
 
 
-def _comparable(key: str, provenance: Mapping[str, Any]) -> Any:
-    value = provenance.get(key)
-    if key == "versions" and isinstance(value, Mapping):
-        return {name: version for name, version in value.items() if name not in _IDLE_PACKAGES}
-    return value
+def _packages(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the versions of the packages that rows depend on; older runs recorded some extras among `versions`."""
+    told = [part for key in ("versions", "extras") if isinstance(part := provenance.get(key), Mapping)]
+    return {name: version for part in told for name, version in part.items() if name not in _IDLE_PACKAGES}
+
+
+def _shared(one: Mapping[str, Any], two: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return of each what both recorded."""
+    return [{name: each[name] for name in one if name in two} for each in (one, two)]
 
 
 def _threads(provenance: Mapping[str, Any]) -> Any:

@@ -1,0 +1,44 @@
+"""Every package of an extra is recorded, and a run of an earlier version, which recorded fewer, goes on."""
+
+import tomllib
+from contextlib import nullcontext
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from cdpipe.core.errors import InputError
+from eval.core import provenance
+from eval.running.scaling.merged_provenance import resume_provenance
+
+NOW = provenance.describe_run({"seeds": [1]}, {}, {}, ["run"], None, "")
+
+
+def test_every_package_of_an_extra_is_classed() -> None:
+    text = (Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8")
+    extras = tomllib.loads(text)["project"]["optional-dependencies"]
+    of_users = [lines for name, lines in extras.items() if name not in ("test", "dev")]
+    named = {Requirement(line).name for lines in of_users for line in lines}
+    classed = [*provenance._PACKAGES, *provenance._OF_RECORDINGS, *provenance.IDLE]
+    assert named <= set(classed)
+    assert sorted(classed) == sorted({*NOW["versions"], *NOW["extras"]} - {"python"})
+
+
+def test_workers_agree_on_what_rows_depend_on() -> None:
+    assert {"genz-icp", "ouster-sdk", "laspy"} <= set(provenance.versions())
+    assert not {"rerun-sdk", "viser", "mlcroissant"} & set(provenance.versions())
+
+
+def test_a_run_of_an_earlier_version_goes_on() -> None:
+    earlier = {**NOW, "versions": {**NOW["versions"], "plotly": "7", "viser": "none"}}
+    del earlier["extras"], earlier["versions"]["warp-lang"]
+    assert resume_provenance("run", earlier, NOW)["extras"] == NOW["extras"]
+    with pytest.raises(InputError, match=r"numpy: '1\.0' and "):
+        resume_provenance("run", {**earlier, "versions": {**earlier["versions"], "numpy": "1.0"}}, NOW)
+
+
+def test_extras_count_where_rows_depend_on_them() -> None:
+    for name, is_refused in (("rerun-sdk", False), ("mcap", False), ("genz-icp", True), ("laspy", True)):
+        earlier = {**NOW, "extras": {**NOW["extras"], name: "0.0"}}
+        with pytest.raises(InputError, match=f"{name}: '0.0' and ") if is_refused else nullcontext():
+            resume_provenance("run", earlier, NOW)
