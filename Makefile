@@ -6,6 +6,7 @@ OUT ?= demo
 comma := ,
 TEST_PROCESSES ?= 2
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
+# All extras of users but `croissant`, which is part of `dev`, and `rerun`, whose one test is skipped without it.
 EXTRAS := cluster,dufomap,formats,genz,gpu,kiss,m3c2,octomap,odometry,ouster,parquet,view
 LOWEST := .venv-lowest
 NEWEST := .venv-newest
@@ -30,9 +31,10 @@ $(VENV)/.installed: $(BIN)/python pyproject.toml constraints.txt
 	$(PIP) --editable .
 	touch $@
 
-$(VENV)/.installed-dev: $(VENV)/.installed
+# one installation, which is that of `make demo` too
+$(VENV)/.installed-dev: $(BIN)/python pyproject.toml constraints.txt
 	$(PIP) --editable '.[dev,$(EXTRAS)]'
-	touch $@
+	touch $(VENV)/.installed $@
 
 demo: $(VENV)/.installed
 	$(BIN)/tunnelcd demo --out $(OUT)
@@ -40,8 +42,8 @@ demo: $(VENV)/.installed
 test: $(VENV)/.installed-dev
 	$(PYTEST)
 
-# All tests with the oldest version of every package that pyproject.toml allows. Old packages that warn of one another
-# are no failure, nor are sockets that an old distributed leaves to the garbage collector.
+# All tests with the oldest versions that pyproject.toml allows of what is required and of EXTRAS. Old packages that warn
+# of one another are no failure, nor are sockets that an old distributed leaves to the garbage collector.
 test-lowest: $(LOWEST)/.installed
 	OMP_NUM_THREADS=1 $(LOWEST)/bin/python -m pytest -n $(TEST_PROCESSES) --dist loadfile \
 		-W default::DeprecationWarning -W default::PendingDeprecationWarning \
@@ -60,7 +62,7 @@ lowest: $(BIN)/python
 		$(foreach extra,test $(subst $(comma), ,$(EXTRAS)),--extra $(extra)) \
 		--no-annotate --custom-compile-command 'make lowest' --output-file .constraints-lowest.txt
 
-# All tests with the newest version of every package that pyproject.toml allows, on the day of the installation.
+# All tests with the newest versions of these, on the day of the installation.
 test-newest: $(NEWEST)/.installed
 	OMP_NUM_THREADS=1 $(NEWEST)/bin/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
 
@@ -92,7 +94,7 @@ $(AUDIT)/.installed: constraints.txt
 		pip-audit pip-licenses
 	touch $@
 
-# Execute the notebooks. Then kill and disturb a plan and every command that writes, for MINUTES; nothing may be lost.
+# Execute the notebooks. Then kill and disturb a plan and COMMANDS of tests/soak, for MINUTES; nothing may be lost.
 # The table is SOAK/soak.md.
 MINUTES ?= 30
 SOAK ?= soak

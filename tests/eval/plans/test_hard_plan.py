@@ -6,16 +6,22 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from eval.plans.axes import world_of_step
-from eval.plans.plan import load_plan
+from eval.plans.axes import Step, world_of_step
 from scenarios import load_scenario
 from sim.drive.path import plan_path
 from sim.scene import build_world
+from tests.eval.plans.shipped import plan_of
 
 SEED = 10001
 KEYFRAMES_M = 1.0
-PLAN = load_plan("hard")
-STEPS = next(axis for axis in PLAN.axes if axis.name == "range").steps
+N_STEPS = 5
+
+
+def steps() -> tuple[Step, ...]:
+    """Return the steps of the axis `range`."""
+    found = next(axis for axis in plan_of("hard").axes if axis.name == "range").steps
+    assert len(found) == N_STEPS
+    return found
 
 
 def ranges_m(settings: tuple[str, ...]) -> tuple[list[float], float]:
@@ -28,15 +34,19 @@ def ranges_m(settings: tuple[str, ...]) -> tuple[list[float], float]:
     return found, scenario.score_radius_m
 
 
-@pytest.mark.parametrize("number", [1, *(pytest.param(step, marks=pytest.mark.soak) for step in (0, 2, 3)), 4])
+@pytest.mark.parametrize(
+    "number", [1, *(pytest.param(step, marks=pytest.mark.soak) for step in (0, 2, 3)), N_STEPS - 1]
+)
 def test_a_region_at_a_keyframe_can_find_a_change_at_every_range(number: int) -> None:
-    found, score_radius_m = ranges_m(STEPS[number].set)
+    step = steps()[number]
+    found, score_radius_m = ranges_m(step.set)
     assert np.hypot(max(found), KEYFRAMES_M / 2) < score_radius_m
-    assert abs(np.median(found) - float(STEPS[number].value)) < 0.6
+    assert abs(np.median(found) - float(step.value)) < 0.6
 
 
 def test_all_ranges_are_scored_alike() -> None:
-    assert len({setting for step in STEPS for setting in step.set if setting.startswith("score_radius_m")}) == 1
-    assert all(any(setting.startswith("score_radius_m") for setting in step.set) for step in STEPS)
+    plan = plan_of("hard")
+    assert len({setting for step in steps() for setting in step.set if setting.startswith("score_radius_m")}) == 1
+    assert all(any(setting.startswith("score_radius_m") for setting in step.set) for step in steps())
     # a radius of one preset that differs between steps would be a difficulty of its own
-    assert {world_of_step(PLAN.base, step) for step in STEPS} == set(PLAN.wide)
+    assert {world_of_step(plan.base, step) for step in steps()} == set(plan.wide)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -13,23 +14,24 @@ from eval.plans.cells import expand_cells
 from eval.plans.changes import change_plan
 from eval.plans.plan import load_plan
 from eval.plans.variants import Cell
+from tests.eval.plans.shipped import cells_of, plan_of
 
 VALIDATION, TEST = range(10000, 20000), range(20000, 30000)
 HELD_OUT = ("cave", "site1", "site2")
 
 
 def pairs_by_kind(name: str) -> Counter[str]:
-    plan = load_plan(name)
+    plan = plan_of(name)
     kinds = {world.label: world.pair_kind for world in plan.worlds}
-    return Counter(kinds[label] for label, _ in {(cell.scenario, cell.seed) for cell in expand_cells(plan)})
+    return Counter(kinds[label] for label, _ in {(cell.scenario, cell.seed) for cell in cells_of(name)})
 
 
-def variants(found: list[Cell]) -> list[str]:
+def variants(found: Iterable[Cell]) -> list[str]:
     return list(dict.fromkeys(cell.variant for cell in found))
 
 
 def test_merge_has_two_hundred_test_pairs_of_four_kinds_and_four_methods() -> None:
-    found = expand_cells(load_plan("merge"))
+    found = cells_of("merge")
     counts = pairs_by_kind("merge")
     assert set(counts) == {"clean", "drift", "smooth", "disjoint"}
     assert counts.total() >= 200
@@ -38,7 +40,7 @@ def test_merge_has_two_hundred_test_pairs_of_four_kinds_and_four_methods() -> No
     assert variants(found) == ["tunnelcd", "frame", "kiss-matcher", "oracle-merge"]
     assert {cell.until for cell in found} == {"merge"}
     assert {cell.seed for cell in found} <= set(TEST)
-    worlds = load_plan("merge").worlds
+    worlds = plan_of("merge").worlds
     # only true odometry asks for an exact merge; all other kinds are asked with both odometries
     assert {world.odometry for world in worlds if world.pair_kind == "clean"} == {"own"}
     assert sum(world.n_seeds for world in worlds if world.odometry == "kiss-icp" and world.n_seeds) >= 100
@@ -51,20 +53,20 @@ def test_merge_has_two_hundred_test_pairs_of_four_kinds_and_four_methods() -> No
 
 
 def test_thresholds_are_chosen_on_validation_pairs_of_the_same_kinds() -> None:
-    found = expand_cells(load_plan("merge-gates"))
+    found = cells_of("merge-gates")
     counts = pairs_by_kind("merge-gates")
     assert set(counts) == set(pairs_by_kind("merge"))
     assert 60 <= counts.total() <= 100
     assert {cell.seed for cell in found} <= set(VALIDATION)
     assert not any(name in cell.scenario for cell in found for name in HELD_OUT)
     assert variants(found) == ["tunnelcd[merge.accept_all=true]"]
-    of_merge = {world.name: world.pair_kind for world in load_plan("merge").worlds}
-    for world in load_plan("merge-gates").worlds:
+    of_merge = {world.name: world.pair_kind for world in plan_of("merge").worlds}
+    for world in plan_of("merge-gates").worlds:
         assert of_merge[world.name] == world.pair_kind
 
 
 def test_noise_has_each_error_alone_for_both_methods() -> None:
-    found = expand_cells(load_plan("merge-noise"))
+    found = cells_of("merge-noise")
     noises = {(cell.preset, cell.oracle and (cell.oracle.noise_m, cell.oracle.noise_deg)) for cell in found}
     ours, theirs = ({noise for name, noise in noises if name == each} for each in ("tunnelcd", "voxel-diff"))
     assert ours == theirs >= {None, (0, 0)}

@@ -17,6 +17,7 @@ from eval.plans.targets import Targets
 from eval.plans.variants import name_variant
 from eval.plans.worlds import format_setting, require_draws, world_slug
 from eval.running.runfolder import reported
+from tests.eval.plans.shipped import cells_of, plan_of
 
 PLAN = """\
 name: two
@@ -203,7 +204,7 @@ def test_presets_of_the_command_line_replace_the_plan_s_variants_and_grids(tmp_p
     # a preset alone keeps what the plan sets for it at a site; the plan's targets are about its own variants
     of_plan = {c.scenario: c.config for c in expand_cells(read(tmp_path)) if c.variant == "paper"}
     assert {c.scenario: c.config for c in expand_cells(change_plan(read(tmp_path), presets=["paper"]))} == of_plan
-    assert change_plan(load_plan("main"), presets=["c2c"]).targets == Targets()
+    assert change_plan(plan_of("main"), presets=["c2c"]).targets == Targets()
     with pytest.raises(InputError, match=r"voxel-dif.*voxel-diff"):
         change_plan(plan, presets=["voxel-dif"])
 
@@ -261,11 +262,11 @@ def test_unchanged_plan_stays_equal(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", plan_names())
 def test_shipped_plans_are_valid(name: str) -> None:
-    assert expand_cells(load_plan(name))
+    assert cells_of(name)
 
 
 def test_paper_plan_holds_what_the_page_shows() -> None:
-    found = expand_cells(load_plan("paper"))
+    found = cells_of("paper")
     presets = ["paper", "paper-topn", "paper-paired", "voxel-diff", "untrained", "random-regions", "tunnelcd"]
     for scenario in ("paper/site1", "paper/site2", "unchanged/site1"):
         plain = [c for c in found if c.scenario == scenario and "[" not in c.variant]
@@ -557,8 +558,7 @@ grid:
 
 
 def test_surface_is_a_section_of_the_method_and_a_list_of_the_world() -> None:
-    plan = load_plan("surface")
-    assert {cell.config.surface.method for cell in expand_cells(plan)} == {
+    assert {cell.config.surface.method for cell in cells_of("surface")} == {
         "planes", "m3c2", "m3c2-ep", "c2c", "c2m", "unrolled",
     }  # fmt: skip
     with pytest.raises(ValueError, match="surface"):

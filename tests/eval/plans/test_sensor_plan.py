@@ -3,6 +3,7 @@
 import hashlib
 import json
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,32 +14,62 @@ from pydantic.fields import FieldInfo
 from cdpipe.model.config import load_config
 from cdpipe.sensor.ouster import load_profile, profile_names
 from eval.core.statistics import ENOUGH_PAIRS
-from eval.plans.cells import expand_cells
-from eval.plans.plan import load_plan
-from eval.plans.worlds import find_references, list_settings_over, list_worlds
+from eval.plans.files import read_plan
+from eval.plans.worlds import World, find_references, list_settings_over
 from scenarios.library import load_scenario
 from scenarios.schema import Sensor
 from sim.session.simulate import simulate_pair
 from sim.session.truth import PairTruth, read_labels, read_pair_truth, read_true_poses
+from tests.eval.plans.shipped import cells_of, plan_of
 
-PLAN = load_plan("sensor")
-WORLDS = list_worlds(PLAN.scenarios)
-REFERENCE = WORLDS[0]
-OVER = {list_settings_over(world.label, REFERENCE.label) for world in WORLDS[1:]}
-PLAIN = load_scenario(REFERENCE.name, 0, REFERENCE.settings).sensor
+# as the file has them: only a test should wait for the plan to be checked
+WRITTEN = [[each] if isinstance(each, str) else each for each in read_plan("sensor").value["scenarios"][0]["each"]]
+OVER = sorted(",".join(each) for each in WRITTEN)
 SMALL = ("sensor.mode=512x10", "sensor.sub_rays=7", "platform.scan_spacing_m=2.0", "after.end_m=9")
+
+
+@cache
+def first_and_others() -> tuple[World, list[World]]:
+    """Return the first world of the plan, and those that are held against it."""
+    first, *others = [world for world in plan_of("sensor").worlds if world.name == "narrow"]
+    return first, others
+
+
+@cache
+def plain_sensor() -> Sensor:
+    first, _ = first_and_others()
+    return load_scenario(first.name, 0, first.settings).sensor
+
+
+def settings_over(family: str) -> set[str]:
+    """Return what the worlds of a family have set otherwise than its first."""
+    first, *others = [world for world in plan_of("sensor").worlds if world.name == family]
+    held = find_references((world.label, "v", 0) for world in (first, *others))
+    assert held == {(world.label, "v"): first.label for world in others}
+    return {list_settings_over(world.label, first.label) for world in others}
 
 
 def values(name: str, field: FieldInfo) -> list[str]:
     """The values of a switch or of a choice, as settings write them, without that of the plan's first world."""
     options = ("true", "false") if field.annotation is bool else map(str, field.annotation.__args__)  # type: ignore[union-attr]
-    return [value for value in options if value != str(getattr(PLAIN, name)).lower()]
+    return [value for value in options if value != str(getattr(plain_sensor(), name)).lower()]
+
+
+def test_the_settings_of_the_file_are_the_worlds_of_the_plan() -> None:
+    first, others = first_and_others()
+    assert sorted(list_settings_over(world.label, first.label) for world in others) == OVER
 
 
 def test_every_effect_of_the_sensor_has_a_row_of_its_own() -> None:
-    # reflectors and glass need things that narrow lacks; families of plan `mine` have them
-    assert not {PLAIN.retroreflectors, PLAIN.glass} - {False}
+    plain = plain_sensor()
+    # reflectors and glass need things that narrow lacks
+    assert not {plain.retroreflectors, plain.glass} - {False}
     elsewhere = {"retroreflectors", "glass"}
+    glaring = load_scenario("glare/wide", 0).sensor
+    assert glaring.retroreflectors and glaring.glass
+    assert {f"sensor.{name}=false" for name in elsewhere} == settings_over("glare/wide")
+    # in clear air the second return changes nothing
+    assert settings_over("dust/narrow") == settings_over("dust/mist") == {"sensor.returns=dual"}
     switches = [
         name for name, field in Sensor.model_fields.items() if field.annotation is bool and name not in elsewhere
     ]
@@ -46,35 +77,37 @@ def test_every_effect_of_the_sensor_has_a_row_of_its_own() -> None:
     for name in (*switches, "sub_rays", "returns", "range_step_mm"):
         for value in values(name, Sensor.model_fields[name]):
             assert f"sensor.{name}={value}" in OVER
-    assert ",".join(f"sensor.{name}=false" for name in switches if getattr(PLAIN, name)) in OVER
+    assert ",".join(f"sensor.{name}=false" for name in switches if getattr(plain, name)) in OVER
     assert {
-        f"sensor.profile={name}" for name in profile_names() if name.startswith("os1-32") and name != PLAIN.profile
-    } <= OVER
-    assert {"sensor.mode=512x10", "sensor.mode=2048x10"} <= OVER
+        f"sensor.profile={name}" for name in profile_names() if name.startswith("os1-32") and name != plain.profile
+    } <= {*OVER}
+    assert {"sensor.mode=512x10", "sensor.mode=2048x10"} <= {*OVER}
 
 
 def test_all_rows_are_held_against_the_first_and_differ_from_it_in_the_sensor_only() -> None:
-    held = find_references((world.label, "v", 0) for world in WORLDS)
-    assert held == {(world.label, "v"): REFERENCE.label for world in WORLDS[1:]}
-    for seed in PLAN.seeds[:2]:
-        plain = load_scenario(REFERENCE.name, seed, REFERENCE.settings)
-        drawn = [load_scenario(world.name, seed, world.settings) for world in WORLDS[1:]]
+    first, others = first_and_others()
+    held = find_references((world.label, "v", 0) for world in (first, *others))
+    assert held == {(world.label, "v"): first.label for world in others}
+    for seed in plan_of("sensor").seeds[:2]:
+        plain = load_scenario(first.name, seed, first.settings)
+        drawn = [load_scenario(world.name, seed, world.settings) for world in others]
         assert all(each.model_copy(update={"sensor": plain.sensor}) == plain for each in drawn)
         sensors = [plain.sensor, *(each.sensor for each in drawn)]
         assert all(sensors.count(sensor) == 1 for sensor in sensors)
 
 
 def test_there_are_pairs_enough_to_set_a_difference_in_bold() -> None:
-    assert len(PLAN.seeds) >= ENOUGH_PAIRS
+    assert len(plan_of("sensor").seeds) >= ENOUGH_PAIRS
 
 
 def test_no_threshold_hides_an_effect() -> None:
-    found = expand_cells(PLAN)
-    as_in_tune = {value for grid in load_plan("tune").grid for value in grid.keys["query.n_regions"]}
-    assert len({cell.scenario for cell in found}) == len(WORLDS)
+    found = cells_of("sensor")
+    as_in_tune = {value for grid in plan_of("tune").grid for value in grid.keys["query.n_regions"]}
+    assert {cell.scenario for cell in found} == {world.label for world in plan_of("sensor").worlds}
     for cell in found:
         assert {cell.config.query.n_regions} == as_in_tune
-        assert cell.config.query.radius_m == ("width" if cell.preset == "tunnelcd" else 4.5)
+        told = 10.0 if cell.scenario.startswith("glare/wide") else 4.5
+        assert cell.config.query.radius_m == ("width" if cell.preset == "tunnelcd" else told)
     variants = {cell.config.regions.source: cell.config for cell in found}
     assert set(variants) == {"sphere", "voxel-diff"}
     assert variants["voxel-diff"].extract == load_config("voxel-diff").extract
@@ -113,7 +146,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Session:
     return simulated(tmp_path_factory.mktemp("plain"))
 
 
-@pytest.mark.parametrize("settings", sorted(OVER))
+@pytest.mark.parametrize("settings", OVER)
 def test_the_world_and_the_drive_are_the_same_under_every_sensor(plain: Session, tmp_path: Path, settings: str) -> None:
     found = simulated(tmp_path, *settings.split(","))
     np.testing.assert_array_equal(found.poses, plain.poses)

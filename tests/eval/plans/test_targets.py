@@ -10,6 +10,7 @@ from eval.plans.changes import change_plan
 from eval.plans.files import plan_names
 from eval.plans.plan import load_plan
 from eval.plans.targets import Target, Targets, read_targets
+from tests.eval.plans.shipped import plan_of
 
 PLAN = {"name": "tiny", "scenarios": ["smoke/one_box"], "seeds": [1], "variants": [{"preset": "paper"}]}
 
@@ -21,13 +22,13 @@ def written(folder: Path, **more: object) -> str:
 
 
 def test_a_plan_takes_those_of_another_by_its_name(tmp_path: Path) -> None:
-    assert load_plan(written(tmp_path, targets="main")).targets == load_plan("main").targets
+    assert load_plan(written(tmp_path, targets="main")).targets == plan_of("main").targets
     assert load_plan(written(tmp_path)).targets == Targets()
 
 
 @pytest.mark.parametrize("name", plan_names())
 def test_a_run_finds_its_targets_whether_its_plan_was_stored_with_them_or_before_there_were_any(name: str) -> None:
-    plan = change_plan(load_plan(name), seeds="1:3")
+    plan = change_plan(plan_of(name), seeds="1:3")
     document = plan.model_dump(mode="json")
     assert read_targets({"plan": document}) == plan.targets
     assert read_targets({"plan": {key: value for key, value in document.items() if key != "targets"}}) == plan.targets
@@ -50,7 +51,7 @@ def test_mistakes_of_the_plan_whose_targets_are_taken_are_told_at_its_lines(tmp_
         with pytest.raises(InputError, match=told):
             load_plan(written(tmp_path, targets=str(other)))
     other.write_text("targets: main\n")
-    assert load_plan(written(tmp_path, targets=str(other))).targets == load_plan("main").targets
+    assert load_plan(written(tmp_path, targets=str(other))).targets == plan_of("main").targets
 
 
 def test_a_run_of_an_unknown_plan_has_none() -> None:
