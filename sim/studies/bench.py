@@ -109,6 +109,7 @@ def sensor_contests(site: BenchSite) -> dict[str, Callable[[], Contest]]:
         "casting-bare": lambda: against_embree(site),
         "casting-two-threads": lambda: two_threads(site),
         "session": lambda: time_session(site, site.drive, 15.0),
+        "session-dust-dual": lambda: time_session(site, dusty_drive(site), 1.0),
         "session-19-sub-rays": lambda: time_session(site, spread_drive(site), 3.0),
         "session-19-sub-rays-gpu": lambda: time_gpu_session(site, 10.0),
     }
@@ -211,6 +212,19 @@ def spread_drive(site: BenchSite) -> Drive:
     drive = site.drive
     trajectory = record(drive.trajectory.true, spread, site.sensor, site.seed, drive.name)
     return replace(drive, scenario=spread, trajectory=trajectory)
+
+
+def dusty_drive(site: BenchSite) -> Drive:
+    """Return the same drive in the dust of `dust/narrow`, with seven sub-rays and two returns a beam."""
+    scenario, drive = site.drawn, site.drive
+    air = load_scenario("dust/narrow", site.seed).before.air
+    dusty = scenario.model_copy(
+        update={
+            "sensor": scenario.sensor.model_copy(update={"sub_rays": 7, "returns": "dual"}),
+            "before": scenario.before.model_copy(update={"air": air}),
+        }
+    )
+    return replace(drive, scenario=dusty)
 
 
 def time_gpu_session(site: BenchSite, target: float) -> Contest:

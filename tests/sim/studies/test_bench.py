@@ -1,16 +1,23 @@
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
+from cdpipe.core.progress import report_nothing
+from cdpipe.io.session import read_session
 from sim.geometry.raycast import Caster, model_meshes
 from sim.props.shapes import solid_mesh
 from sim.scene import compile_model
+from sim.sensor.air import AIR
+from sim.session.simulate import write_session
+from sim.session.truth import read_labels
 from sim.studies import bench
-from sim.studies.bench import BenchSite, crowd, mujoco_hits, sensor_contests, spread_drive, time_session
+from sim.studies.bench import BenchSite, crowd, dusty_drive, mujoco_hits, sensor_contests, spread_drive, time_session
 from sim.studies.timing import Contest, SkippedContest
 
 
@@ -29,7 +36,9 @@ def test_every_row_has_its_rival_and_its_target(site: BenchSite) -> None:
         "casting-bare": pytest.approx(1 / 1.2),
         "casting-two-threads": 1.7,
     }
-    assert {"session", "session-19-sub-rays", "session-19-sub-rays-gpu"} == named.keys() - found.keys()
+    assert named.keys() - found.keys() == {
+        "session", "session-dust-dual", "session-19-sub-rays", "session-19-sub-rays-gpu",
+    }  # fmt: skip
     n_mrays = site.sensor.width * site.sensor.height / 1e6
     for name, contest in found.items():
         if name == "world":
@@ -89,6 +98,17 @@ def test_a_session_is_held_against_the_time_it_took_to_record(site: BenchSite) -
     assert (contest.unit, contest.work, contest.target) == ("revolutions/s", n_scans, 1.0)
     assert contest.rival_seconds == (pytest.approx(n_scans * 0.1),)
     assert len(contest.seconds) == 3
+
+
+def test_a_dusty_session_has_dust_and_second_returns(site: BenchSite, tmp_path: Path) -> None:
+    drive = dusty_drive(site)
+    assert drive.trajectory is site.drive.trajectory  # the same revolutions
+    few = replace(drive, trajectory=spread_drive(site).trajectory)
+    with ThreadPoolExecutor(1) as pool:
+        write_session(few, tmp_path / "before", pool, report_nothing)
+    session = read_session(tmp_path / "before")
+    assert session.n_returns == 2
+    assert any((instance == AIR).any() for instance, _ in read_labels(session.path, session.n_chunks))
 
 
 def test_measuring_leaves_nothing_behind(site: BenchSite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
