@@ -17,6 +17,8 @@ import trimesh
 from eval.cli.main import main
 from eval.core.tablefile import read_table, table_file
 
+pytestmark = pytest.mark.usefixtures("usual_repeat_below_s")
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 
@@ -104,7 +106,10 @@ def test_radius_and_voxel_are_ablated(recipe: Callable[[str], None]) -> None:
     assert Path("grid/index.html").is_file()
 
 
-def test_training_data_is_made_and_trained_on(recipe: Callable[[str], None]) -> None:
+def test_training_data_is_made_and_trained_on(
+    recipe: Callable[[str], None], shards_once: Callable[..., list[bytes]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("eval.training.dataset_run.make_shards", shards_once)
     recipe("train")
     assert {path.name for path in Path("trained").iterdir()} >= {"sphere.safetensors", "sphere.json", "curves.csv"}
 

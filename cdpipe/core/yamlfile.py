@@ -96,7 +96,7 @@ def read_yaml(path: Path, text: str | None = None) -> Document:
     return replace(document, value=deepcopy(document.value))
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def _parse(path: str, text: str) -> Document:
     """Parse a text; cached, because one family is drawn with many seeds and parsing is the slow part."""
     try:

@@ -91,7 +91,8 @@ def scanned(
     for along in np.arange(4.0, LENGTH_M - 4.0, 0.5):
         heading = np.arctan2(bend(np.array(along + 0.1), world) - bend(np.array(along - 0.1), world), 0.2)
         world_T_sensor = yaw_pose(heading + mount_rad, (along, bend(np.array(along), world), 1.5))
-        near = np.flatnonzero(np.linalg.norm(points - world_T_sensor[:3, 3], axis=1) < 12.0)
+        near = np.flatnonzero(np.abs(points[:, 0] - along) < 12.0)  # the others are farther still
+        near = near[np.linalg.norm(points[near] - world_T_sensor[:3, 3], axis=1) < 12.0]
         seen = points[rng.choice(near, 6000, replace=False)]
         seen = seen + rng.normal(0, 0.005, seen.shape)
         clouds.append(transform(invert(world_T_sensor), seen))

@@ -10,6 +10,8 @@ from cdpipe.core.geometry import invert, make_pose, yaw_pose
 from cdpipe.io.session import ScanChunk, SessionWriter
 from cdpipe.sensor.ouster import SensorMetadata
 from eval.cli.main import main
+from eval.training import dataset_run
+from eval.training.dataset import Recipe
 from sim.session.truth import PairTruth, write_labels, write_pair_truth, write_true_poses
 from tests.eval.changes import change
 
@@ -76,6 +78,22 @@ def write_pair(pair: Path, *, has_changes: bool = True, stretch: float = 1.0) ->
         write_session(pair / name, name, has_changes=has_changes, stretch=stretch)
     write_pair_truth(pair, PairTruth("test", 7, 3.0, tuple(changes) if has_changes else (), {}))
     return pair
+
+
+@pytest.fixture(scope="session", autouse=True)
+def stages_are_called_once(usual_repeat_below_s: float) -> None:
+    """Let no run repeat a stage for the clock."""
+
+
+@pytest.fixture(scope="session")
+def training_data(tmp_path_factory: pytest.TempPathFactory, shards_once: Callable[..., list[bytes]]) -> Path:
+    """Training data of two tunnels, one of each split. Tests read it only."""
+    folder = tmp_path_factory.mktemp("training") / "data"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dataset_run, "make_shards", shards_once)
+        for seeds in ("3:4", "10003:10004"):
+            dataset_run.make_dataset(["smoke/one_box"], seeds, Recipe(draws=2), folder, command="test")
+    return folder
 
 
 @pytest.fixture(name="write_tiny_pair")

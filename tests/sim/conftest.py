@@ -8,7 +8,19 @@ from typing import Any
 import pytest
 
 from cdpipe.sensor.ouster import SensorMetadata, load_profile
-from scenarios.schema import Drift, Place, Platform, Prop, Roughness, Scenario, Section, Sensor, SessionPlan, Tunnel
+from scenarios.schema import (
+    Drift,
+    Mover,
+    Place,
+    Platform,
+    Prop,
+    Roughness,
+    Scenario,
+    Section,
+    Sensor,
+    SessionPlan,
+    Tunnel,
+)
 
 
 @pytest.fixture(scope="session")
@@ -53,6 +65,26 @@ def make_prop() -> Callable[..., Prop]:
         return Prop(name=name, **(settings | override))
 
     return make
+
+
+@pytest.fixture(scope="session")
+def moving_scenario(make_scenario: Callable[..., Scenario], make_prop: Callable[..., Prop]) -> Scenario:
+    """A drift of 20 m in which a person walks, a forklift drives and a curtain hangs."""
+    tunnel = make_scenario().tunnel.model_copy(update={"section": Section(width_m=5.0, height_m=3.2)})
+    movers: list[dict[str, Any]] = [
+        {"name": "walker", "kind": "person"},
+        {"name": "truck", "kind": "forklift", "sessions": "after", "path": {"length_m": 5}},
+        {"name": "curtain", "kind": "curtain", "width_m": 0.9, "sessions": "before"},
+    ]
+    return make_scenario(
+        tunnel=tunnel,
+        props=(
+            make_prop("box", 0.35, change="added"),
+            make_prop("barrel", 0.6, 0.8, kind="barrel", size_m=(0.6, 0.6, 0.9)),
+        ),
+        movers=tuple(Mover.model_validate(each) for each in movers),
+        sensor=Sensor(mode="512x10", sub_rays=7),
+    )
 
 
 @pytest.fixture(scope="session")

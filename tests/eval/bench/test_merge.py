@@ -23,7 +23,7 @@ PARTS = {"t_index_s": 2.0, "t_merge_s": 0.5, "t_refine_s": 8.0}
 
 
 @pytest.fixture(scope="module")
-def site() -> MergeSite:
+def site(thinned: None) -> MergeSite:
     """The smallest world there is."""
     return MergeSite("tiny", "smoke/one_box", Goals(0.1, 4.0, 10.0, 3.0), kiss_voxel_m=0.5, repeats=2)
 

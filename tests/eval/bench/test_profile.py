@@ -12,11 +12,13 @@ from cdpipe.core.errors import ScenarioError
 from cdpipe.io.session import read_session
 from eval.bench import profile
 from eval.bench.profile import as_markdown, measure_profile
-from scenarios.library import load_scenario
 from sim.session.simulate import simulate_pair
+from tests.eval.running.runs import load_small
+
+pytestmark = pytest.mark.usefixtures("thinned")
 
 
-def test_the_profile_of_a_small_pair(tmp_path: Path) -> None:
+def test_the_profile_of_a_small_pair() -> None:
     told: list[tuple[str, int, int]] = []
     table = measure_profile(
         ["smoke/one_box"], 20000, has_surface=True, on_progress=lambda *args: told.append(args),
@@ -40,7 +42,7 @@ def test_the_profile_of_a_small_pair(tmp_path: Path) -> None:
 
 
 def test_what_is_profiled_writes_what_simulate_writes(tmp_path: Path) -> None:
-    scenario = load_scenario("smoke/one_box", 20000)
+    scenario = load_small("smoke/one_box", 20000)
     simulate_pair(scenario, 20000, tmp_path / "pair")
     profile._simulate("smoke/one_box", 20000, tmp_path)
     for name in ("before", "after"):

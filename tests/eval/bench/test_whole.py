@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
 from cdpipe.core.errors import InputError
 from eval.bench.bench import list_contests, measure
 from eval.bench.whole import WholeSite, whole_contests
 from sim.studies.timing import Contest
 
 
+@pytest.mark.usefixtures("thinned")
 def test_rows_of_a_small_world() -> None:
     small = WholeSite(wide="smoke/one_box", training="smoke/one_box", recorded="smoke/one_box", repeats=1)
     rows = {row["name"]: row for row in measure(whole_contests(small))["rows"]}

@@ -6,6 +6,7 @@ import pytest
 
 from eval.plans.plan import load_plan
 from eval.running.runfolder import RunFolder
+from eval.running.stages import pair_stages
 from scenarios.schema import Scenario
 from tests.eval.running.runs import ONE_BOX, UNCHANGED, Runner, load_small
 
@@ -21,11 +22,19 @@ def runner(pairs: dict[str, Path]) -> Runner:
     return Runner(pairs)
 
 
+@pytest.fixture
+def timed_as_usual(usual_repeat_below_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Repeat short stages for the clock, as users' runs do."""
+    monkeypatch.setattr(pair_stages, "REPEAT_BELOW_S", usual_repeat_below_s)
+
+
 @pytest.fixture(scope="module")
-def smoke(pairs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """The smoke plan, run once end to end."""
+def smoke(pairs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory, usual_repeat_below_s: float) -> RunFolder:
+    """The smoke plan, run once end to end and timed as users' runs are."""
     folder = tmp_path_factory.mktemp("smoke") / "run"
-    return Runner(pairs).run(folder, load_plan("smoke"), command=["tunnelcd", "run", "a b"])[0]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pair_stages, "REPEAT_BELOW_S", usual_repeat_below_s)
+        return Runner(pairs).run(folder, load_plan("smoke"), command=["tunnelcd", "run", "a b"])[0]
 
 
 @pytest.fixture

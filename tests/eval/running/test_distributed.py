@@ -37,6 +37,7 @@ from eval.running.run_workers import Task, _unfit, remove_traces, work_on
 from eval.running.runfolder import RunFolder, start_run_folder, write_json
 from eval.running.runner import RunOutcome, run_plan
 from eval.running.schedule import schedule_pairs
+from tests.eval.plans.shipped import plan_of
 
 distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
 HOOKED, ROOT = Path(__file__).parent / "hooked", Path(__file__).parents[3]
@@ -115,9 +116,14 @@ def lasting_workers(hook: Path, environment: dict[str, str], tmp_path_factory: p
 
 
 @pytest.fixture
-def workers(lasting_workers: Workers, monkeypatch: pytest.MonkeyPatch) -> Iterator[Workers]:
+def one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give this process the numbers of threads that `environment` gives to others: rows of both are not mixed else."""
     for name in cluster.THREAD_VARIABLES:
         monkeypatch.setenv(name, "1")
+
+
+@pytest.fixture
+def workers(lasting_workers: Workers, one_thread: None) -> Iterator[Workers]:
     with distributed.Client(lasting_workers.where.scheduler) as client:
         client.wait_for_workers(2, timeout=60)
     lasting_workers.spare()
@@ -261,7 +267,7 @@ def test_a_full_disk_ends_the_run_in_one_line_and_the_next_goes_on(
     assert hidden(folder) == []
 
 
-@pytest.mark.usefixtures("copies")
+@pytest.mark.usefixtures("copies", "one_thread")
 def test_a_killed_client_takes_its_workers_along_and_loses_nothing_finished(
     tmp_path: Path, plan: Plan, environment: dict[str, str], hook: Path
 ) -> None:
@@ -375,7 +381,7 @@ def test_a_machine_is_shared_where_two_tasks_run_at_a_time() -> None:
 
 @pytest.mark.parametrize("name", ["objects", "merge-noise", "merge-gates"])  # oracles, an early end
 def test_a_task_is_the_same_after_its_way_through_json(tmp_path: Path, name: str) -> None:
-    plan = load_plan(name)
+    plan = plan_of(name)
     plan = plan.model_copy(update={"seeds": plan.seeds[:1]})
     for pair in schedule_pairs(RunFolder(tmp_path), plan, expand_cells(plan), False, Tools()):
         task = Task(tmp_path, "token", pair, Made("commit"))
@@ -557,28 +563,36 @@ if __name__ == "__main__":
         scratch = client.run(lambda dask_worker: dask_worker.local_directory)
         top = {os.path.dirname(os.path.dirname(folder)) for folder in scratch.values()}
         modes = [os.stat(folder).st_mode & 0o777 for folder in top]
-        print(json.dumps({"hosts": sorted(hosts), "modes": modes, "folders": sorted(top), "n_processes": len(own)}))
+        told = {"hosts": sorted(hosts), "modes": modes, "folders": sorted(top), "n_processes": len(own)}
+        names = ("MALLOC_TRIM_THRESHOLD_", "OMP_NUM_THREADS")
+        print(json.dumps(told | {name: [*client.run(os.environ.get, name).values()] for name in names}))
 """
 
 
-def test_workers_of_this_machine_let_nobody_in(tmp_path: Path, environment: dict[str, str]) -> None:
-    hostile, program = tmp_path / "hostile", tmp_path / "bin" / "program"
+@pytest.fixture(scope="module", name="told")
+def told_fixture(environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What workers of this machine tell; they start in a folder with modules that nobody should import."""
+    folder = tmp_path_factory.mktemp("program")
+    hostile, program = folder / "hostile", folder / "bin" / "program"
     hostile.mkdir()
     for name in ("json", "pickle", "multiprocessing", "cdpipe"):
         (hostile / f"{name}.py").write_text("from pathlib import Path\nPath('run').touch()\n")
     program.parent.mkdir()
     program.write_text(PROGRAM)
-    argv, options = [sys.executable, str(program)], {"cwd": hostile, "env": environment, "capture_output": True}
-    told = json.loads(subprocess.run(argv, check=True, **options).stdout)  # type: ignore[call-overload]
+    unset = ("MALLOC_TRIM_THRESHOLD_", *cluster.THREAD_VARIABLES)
+    plain = {name: value for name, value in environment.items() if name not in unset}
+    done = subprocess.run([sys.executable, str(program)], cwd=hostile, env=plain, check=True, capture_output=True)
+    return {**json.loads(done.stdout), "is_hostile_run": (hostile / "run").exists()}
+
+
+def test_workers_of_this_machine_let_nobody_in(told: dict[str, Any]) -> None:
     assert told["n_processes"] > 2
     assert told["hosts"] == ["127.0.0.1"]
     assert told["modes"] == [0o700]
     assert not any(Path(folder).exists() for folder in told["folders"])
-    assert not (hostile / "run").exists()
+    assert not told["is_hostile_run"]
 
 
-def test_workers_of_this_machine_keep_freed_memory_and_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("MALLOC_TRIM_THRESHOLD_", raising=False)
-    with cluster.connected(Where(workers=1), 1) as client:
-        assert client.submit(os.environ.get, "MALLOC_TRIM_THRESHOLD_").result() is None
-        assert client.submit(os.environ.get, "OMP_NUM_THREADS").result() == "1"
+def test_workers_of_this_machine_keep_freed_memory_and_one_thread(told: dict[str, Any]) -> None:
+    assert told["MALLOC_TRIM_THRESHOLD_"] == [None, None]
+    assert told["OMP_NUM_THREADS"] == ["1", "1"]

@@ -441,6 +441,7 @@ def test_the_pipeline_never_sees_truth(pairs: dict[str, Path], tmp_path: Path) -
     assert type(with_truth) is type(open_session(bare / "after"))
 
 
+@pytest.mark.usefixtures("timed_as_usual")
 def test_time_is_the_median_of_three_after_a_warm_up() -> None:
     clock = 0.0
     # the middle one of three in each part, whichever call it was
@@ -458,6 +459,7 @@ def test_time_is_the_median_of_three_after_a_warm_up() -> None:
     assert next(parts, None) is None
 
 
+@pytest.mark.usefixtures("timed_as_usual")
 def test_a_long_call_is_timed_once() -> None:
     clock = 0.0
     calls = 0

@@ -10,11 +10,10 @@ import yaml
 
 from cdpipe.core.geometry import stream
 from eval.core.statistics import N_RESAMPLES, clustered_interval, mean_with_interval
-from eval.plans.cells import expand_cells
-from eval.plans.plan import load_plan
 from eval.plans.targets import Target, Targets
 from eval.tables.groups import group_overview, main_changes, objects_by_group
 from eval.tables.object_table import FILES, ORACLE_VARIANT, object_overview, object_tables
+from tests.eval.plans.shipped import cells_of
 
 NAN = float("nan")
 TEST = range(20000, 30000)
@@ -194,7 +193,7 @@ def test_clustered_intervals_equal_plain_resampling(statistic: str) -> None:
 
 
 def test_the_plan_of_objects_varies_the_rule_alone() -> None:
-    found = expand_cells(load_plan("objects"))
+    found = cells_of("objects")
     assert {cell.seed for cell in found} <= set(TEST)
     of_site = {cell.variant: cell for cell in found if cell.scenario == "regions/site2"}
     ours = of_site["tunnelcd"]

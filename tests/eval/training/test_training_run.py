@@ -15,26 +15,21 @@ import torch
 from cdpipe.descriptors.sphere_network import load_sphere_network
 from cdpipe.descriptors.weights_file import digest
 from cdpipe.io.answer import read_answer
-from eval.core.terminal.progress import Silent
-from eval.training.dataset import Recipe
-from eval.training.dataset_run import Where, make_dataset
-from scenarios.library import load_scenario
 from scenarios.schema import Scenario
+from tests.eval.running.runs import load_small
 
 Command = Callable[..., tuple[int, str, str]]
 
 
-@pytest.fixture(scope="module", name="data")
-def data_fixture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data")
-    for seeds in ("3:4", "10003:10004"):
-        make_dataset(["smoke/one_box"], seeds, Recipe(draws=2), folder, Where(None, None), None, "test", Silent())
-    return folder
+@pytest.fixture(scope="module", name="pair")
+def pair_fixture(simulated_once: Callable[[Scenario, int], Path]) -> Path:
+    """A small pair; `describe` writes into it, on a copy."""
+    return simulated_once(load_small("smoke/one_box", 20000), 20000)
 
 
-def test_from_a_dataset_to_a_checkpoint_with_its_card(data: Path, tmp_path: Path, command: Command) -> None:
+def test_from_a_dataset_to_a_checkpoint_with_its_card(training_data: Path, tmp_path: Path, command: Command) -> None:
     out = tmp_path / "trained"
-    arguments = ("train", data, "--out", out, "--steps", "3", "--threads", "1", "--quiet")
+    arguments = ("train", training_data, "--out", out, "--steps", "3", "--threads", "1", "--quiet")
     assert command(*arguments)[0] == 0
     checkpoint = out / "sphere.safetensors"
     network = load_sphere_network(checkpoint.read_bytes())
@@ -52,27 +47,25 @@ def test_from_a_dataset_to_a_checkpoint_with_its_card(data: Path, tmp_path: Path
     assert command(*arguments)[0] == 0
     assert checkpoint.read_bytes() == content
     # weights depend on the number of threads: a run goes on with its own
-    code, _, err = command("train", data, "--out", out, "--steps", "3", "--threads", "2", "--quiet")
+    code, _, err = command("train", training_data, "--out", out, "--steps", "3", "--threads", "2", "--quiet")
     assert code == 2 and "with other settings" in err
 
 
-def test_what_was_trained_is_used_at_once(
-    data: Path, tmp_path: Path, command: Command, simulated_once: Callable[[Scenario, int], Path]
-) -> None:
-    pair = tmp_path / "pair"
-    shutil.copytree(simulated_once(load_scenario("smoke/one_box", 20000), 20000), pair)
+def test_what_was_trained_is_used_at_once(training_data: Path, tmp_path: Path, command: Command, pair: Path) -> None:
+    described = tmp_path / "pair"
+    shutil.copytree(pair, described)
     digests, settings = {}, []
     for descriptor, group in (("3deg", "descriptor"), ("sphere", "sphere")):
         options = ("--descriptor", descriptor, "--steps", "1", "--threads", "1", "--quiet")
-        assert command("train", data, "--out", tmp_path / descriptor, *options)[0] == 0
+        assert command("train", training_data, "--out", tmp_path / descriptor, *options)[0] == 0
         digests[descriptor] = json.loads((tmp_path / descriptor / f"{descriptor}.json").read_text())["checkpoint"]
         settings += ["--set", f"{group}.weights={tmp_path / descriptor / descriptor}.safetensors"]
-    sessions = pair / "before", pair / "after"
+    sessions = described / "before", described / "after"
     code, out, _ = command("describe", sessions[0], *settings)
     assert code == 0 and digests["3deg"] in out
     assert command("detect", *sessions, *settings, "--out", tmp_path / "mine", "--quiet")[0] == 0
     assert json.loads((tmp_path / "mine" / "answer.json").read_text())["checkpoints"] == digests
-    _, out, _ = command("score", pair, tmp_path / "mine", "--wide")
+    _, out, _ = command("score", described, tmp_path / "mine", "--wide")
     row = dict(line.split(None, 1) for line in out.splitlines() if len(line.split(None, 1)) == 2)
     assert row["checkpoints"].strip() == ";".join(f"{name} {digest}" for name, digest in digests.items())
     # the shipped weights do not find what was described with others
@@ -87,9 +80,9 @@ def test_what_was_trained_is_used_at_once(
 
 
 def test_a_disk_that_runs_full_leaves_no_half_of_a_file(
-    data: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+    training_data: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    arguments = ("train", data, "--out", tmp_path, "--descriptor", "3deg", "--steps", "1", "--quiet")
+    arguments = ("train", training_data, "--out", tmp_path, "--descriptor", "3deg", "--steps", "1", "--quiet")
     usual = Path.write_bytes
     written: list[str] = []
 
@@ -110,24 +103,25 @@ def test_a_disk_that_runs_full_leaves_no_half_of_a_file(
     assert command(*arguments)[0] == 0
 
 
-def test_the_place_descriptor_is_trained_by_the_same_command(data: Path, tmp_path: Path, command: Command) -> None:
+def test_the_place_descriptor_is_trained_by_the_same_command(
+    training_data: Path, tmp_path: Path, command: Command
+) -> None:
     out = tmp_path / "trained"
     arguments = ("--descriptor", "3deg", "--steps", "2", "--threads", "1", "--quiet")
-    assert command("train", data, "--out", out, *arguments)[0] == 0
+    assert command("train", training_data, "--out", out, *arguments)[0] == 0
     card = json.loads((out / "3deg.json").read_text())
     assert set(card["validation"]["trained"]) == {"recall_at_1", "yaw_error_deg", "yaw_flip_share"}
 
 
 def test_a_network_for_the_rival_is_trained_by_the_same_command_and_used_at_once(
-    data: Path, tmp_path: Path, command: Command, simulated_once: Callable[[Scenario, int], Path]
+    training_data: Path, tmp_path: Path, command: Command, pair: Path
 ) -> None:
     options = ("--descriptor", "range-net", "--steps", "2", "--threads", "1", "--quiet")
-    assert command("train", data, "--out", tmp_path / "trained", *options)[0] == 0
+    assert command("train", training_data, "--out", tmp_path / "trained", *options)[0] == 0
     card = json.loads((tmp_path / "trained" / "range-net.json").read_text())
     names = {"average_precision", "average_precision_change_head", "visibility_accuracy"}
     assert set(card["validation"]["trained"]) == set(card["validation"]["untrained"]) == names
-    pair, checkpoint = simulated_once(load_scenario("smoke/one_box", 20000), 20000), tmp_path / "trained" / "range-net"
-    found = []
+    checkpoint, found = tmp_path / "trained" / "range-net", []
     usual = torch.get_num_threads()
     try:
         for threads, out in ((1, "one"), (2, "two")):
@@ -149,19 +143,19 @@ def test_a_network_for_the_rival_is_trained_by_the_same_command_and_used_at_once
     assert code == 2 and "none.safetensors: missing" in err and len(err.strip().splitlines()) == 1
 
 
-def test_mistakes_are_one_line(data: Path, tmp_path: Path, command: Command) -> None:
+def test_mistakes_are_one_line(training_data: Path, tmp_path: Path, command: Command) -> None:
     def refused(*arguments: object) -> str:
         code, _, err = command("train", *arguments)
         assert code == 2 and len(err.strip().splitlines()) == 1
         return err
 
-    assert "expected sphere or 3deg" in refused(data, "--out", tmp_path / "a", "--descriptor", "spere")
+    assert "expected sphere or 3deg" in refused(training_data, "--out", tmp_path / "a", "--descriptor", "spere")
     assert "made by `tunnelcd dataset`" in refused(tmp_path, "--out", tmp_path / "b")
     assert not (tmp_path / "b").exists()
-    assert "holds training data" in refused(data, "--out", data)
-    assert "--seed" in command("train", data, "--out", tmp_path / "d", "--seed", 2**64)[2]
+    assert "holds training data" in refused(training_data, "--out", training_data)
+    assert "--seed" in command("train", training_data, "--out", tmp_path / "d", "--seed", 2**64)[2]
     training = tmp_path / "training"
-    shutil.copytree(data, training)
+    shutil.copytree(training_data, training)
     rows = (training / "index.csv").read_text().splitlines()
     (training / "index.csv").write_text("\n".join(row for row in rows if "10003" not in row) + "\n")
     assert "split validation" in refused(training, "--out", tmp_path / "c", "--quiet")

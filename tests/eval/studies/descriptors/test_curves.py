@@ -12,20 +12,9 @@ import pytest
 from cdpipe.core.errors import InputError
 from cdpipe.descriptors.sphere_network import SphereSize
 from cdpipe.training.data import TunnelShard
-from eval.core.terminal.progress import Silent
 from eval.studies.descriptors import curves as descriptor_curves
 from eval.studies.descriptors.curve_plots import curves_chart, varying
 from eval.studies.descriptors.curves import BITS, Point, main, points, select_share
-from eval.training.dataset import Recipe
-from eval.training.dataset_run import Where, make_dataset
-
-
-@pytest.fixture(scope="module", name="data")
-def data_fixture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data")
-    for seeds in ("3:4", "10003:10004"):
-        make_dataset(["smoke/one_box"], seeds, Recipe(draws=2), folder, Where(None, None), None, "test", Silent())
-    return folder
 
 
 def _tunnels(**n_of: int) -> list[TunnelShard]:
@@ -99,34 +88,36 @@ def test_the_chart_shows_every_network_and_the_shipped_one() -> None:
 
 
 def test_the_command_goes_on_where_it_was_cut_off(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    training_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     small = [Point(SphereSize(width=0.5)), Point(SphereSize(per_sector=1, width=0.5, reads_after=False))]
     monkeypatch.setattr(descriptor_curves, "points", lambda seeds: small[:seeds])
-    main(data, tmp_path, steps=2, seeds=1)
+    main(training_data, tmp_path, steps=2, seeds=1)
     first = pd.read_csv(tmp_path / "curves.csv")
     assert first["point"].unique().tolist() == ["shipped", small[0].name]
     assert first["bits"].tolist() == 2 * list(BITS) and first["bytes"].tolist() == 2 * [256, 64, 32, 16]
     assert first["seed"].isna().sum() == 4 and (first["n_changes"] == 1).all()
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
     capsys.readouterr()
-    main(data, tmp_path, steps=2, seeds=2)
+    main(training_data, tmp_path, steps=2, seeds=2)
     assert small[0].name not in capsys.readouterr().out  # kept, the other one alone is trained
     second = pd.read_csv(tmp_path / "curves.csv")
     pd.testing.assert_frame_equal(second.head(8), first, check_dtype=False)
     assert second["bytes"].tolist()[8:] == [64, 16, 8, 4] and second["n_weights"].iloc[8] < second["n_weights"].iloc[4]
     # without its row a network is measured again, and not trained
     first.to_csv(tmp_path / "curves.csv", index=False)
-    main(data, tmp_path, steps=2, seeds=2)
+    main(training_data, tmp_path, steps=2, seeds=2)
     again = pd.read_csv(tmp_path / "curves.csv")
     pd.testing.assert_frame_equal(again.drop(columns="cpu_s"), second.drop(columns="cpu_s"), check_dtype=False)
 
 
-def test_rows_of_another_schedule_are_not_mixed(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_of_another_schedule_are_not_mixed(
+    training_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(descriptor_curves, "points", lambda _: [])
-    main(data, tmp_path, steps=2, seeds=1)
+    main(training_data, tmp_path, steps=2, seeds=1)
     with pytest.raises(InputError, match="another number of steps"):
-        main(data, tmp_path, steps=3, seeds=1)
+        main(training_data, tmp_path, steps=3, seeds=1)
     (tmp_path / "curves.csv").write_text("point\nshipped\n")
     with pytest.raises(InputError, match="damaged"):
-        main(data, tmp_path, steps=2, seeds=1)
+        main(training_data, tmp_path, steps=2, seeds=1)
