@@ -14,7 +14,8 @@ AUDIT := .venv-audit
 MUTANTS := .venv-mutants
 PYTHONS ?= python3.11 python3.13
 # One process per core and one thread in each; the tests of one file stay in one process and share what it has set up.
-PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile
+# Files begin in the order of tests/conftest.py, the long ones first.
+PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 
 FUZZ_INPUTS ?= 100000
 

@@ -20,6 +20,27 @@ from sim.session.simulate import simulate_pair
 if TYPE_CHECKING:
     from eval.training.dataset import Recipe
 
+# Seconds of long files: with `--no-loadscope-reorder` of pytest-xdist they begin first, and none is left for the end.
+LONG_S = {
+    "tests/test_readme.py": 136,
+    "tests/eval/running/test_distributed.py": 125,
+    "tests/eval/report/test_page.py": 120,
+    "tests/eval/running/test_runner.py": 102,
+    "tests/eval/cli/test_cli.py": 83,
+    "tests/eval/running/test_worlds_of_a_run.py": 72,
+    "tests/eval/training/test_dataset.py": 58,
+    "tests/eval/plans/test_sensor_plan.py": 46,
+    "tests/eval/running/stages/test_stage_cache.py": 46,
+    "tests/eval/running/test_predictions.py": 45,
+    "tests/eval/training/test_training_run.py": 45,
+    "tests/eval/plans/test_targets.py": 37,
+}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the tests of long files first, the longest before the others; else the order stays."""
+    items.sort(key=lambda item: -LONG_S.get(item.nodeid.partition("::")[0], 0))
+
 
 @pytest.fixture(scope="session")
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], None]], Path]:

@@ -1,4 +1,7 @@
-"""Folders of cdpipe and sim say what they are, export what their stubs list, and load nothing heavy when imported."""
+"""Folders of cdpipe and sim say what they are, export what their stubs list, and load nothing heavy when imported.
+
+Files that `tests/conftest.py` names exist.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from tests.conftest import LONG_S
 
 ROOT = Path(__file__).parents[1]
 HEAVY = {"cdpipe": {"torch", "scipy", "small_gicp"}, "sim": {"mujoco", "scipy", "trimesh"}}
@@ -27,6 +32,10 @@ def test_exported_names_exist(name: str) -> None:
     assert folder.__doc__
     assert folder.__all__
     assert all(getattr(folder, exported) is not None for exported in folder.__all__)
+
+
+def test_files_that_begin_first_exist() -> None:
+    assert [file for file in LONG_S if not (ROOT / file).is_file()] == []
 
 
 @pytest.mark.parametrize("package", HEAVY)

@@ -1,5 +1,7 @@
 """A tiny pair of sessions with truth, written through the real writers: scoring needs no simulation."""
 
+import importlib
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,8 +12,6 @@ from cdpipe.core.geometry import invert, make_pose, yaw_pose
 from cdpipe.io.session import ScanChunk, SessionWriter
 from cdpipe.sensor.ouster import SensorMetadata
 from eval.cli.main import main
-from eval.training import dataset_run
-from eval.training.dataset import Recipe
 from sim.session.truth import PairTruth, write_labels, write_pair_truth, write_true_poses
 from tests.eval.changes import change
 
@@ -81,18 +81,21 @@ def write_pair(pair: Path, *, has_changes: bool = True, stretch: float = 1.0) ->
 
 
 @pytest.fixture(scope="session", autouse=True)
-def stages_are_called_once(usual_repeat_below_s: float) -> None:
-    """Let no run repeat a stage for the clock."""
+def stages_are_called_once(request: pytest.FixtureRequest) -> None:
+    """Let no run repeat a stage for the clock, if a collected test imports the stages: that takes seconds by itself."""
+    if "eval.running.stages.pair_stages" in sys.modules:
+        request.getfixturevalue("usual_repeat_below_s")
 
 
 @pytest.fixture(scope="session")
 def training_data(tmp_path_factory: pytest.TempPathFactory, shards_once: Callable[..., list[bytes]]) -> Path:
     """Training data of two tunnels, one of each split. Tests read it only."""
+    dataset_run = importlib.import_module("eval.training.dataset_run")  # needs torch
     folder = tmp_path_factory.mktemp("training") / "data"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dataset_run, "make_shards", shards_once)
         for seeds in ("3:4", "10003:10004"):
-            dataset_run.make_dataset(["smoke/one_box"], seeds, Recipe(draws=2), folder, command="test")
+            dataset_run.make_dataset(["smoke/one_box"], seeds, dataset_run.Recipe(draws=2), folder, command="test")
     return folder
 
 

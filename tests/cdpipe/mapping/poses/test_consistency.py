@@ -176,7 +176,7 @@ def test_a_scan_that_was_shaken_within_its_revolution_adds_no_points(tunnel: Clo
 
 def test_scans_of_a_place_with_loose_walls_are_kept(tunnel: CloudScans) -> None:
     noisy, rng = jittered(tunnel, 0), stream(0, "loose")
-    clouds = [noisy.scan(index).points_sensor for index in range(len(noisy.odom_T_sensor))]
+    clouds = [noisy.scan(index).points_sensor.copy() for index in range(len(noisy.odom_T_sensor))]
     for cloud in clouds:  # a tenth of all returns is of something that moves
         loose = rng.random(len(cloud)) < 0.1
         cloud[loose] *= rng.uniform(0.8, 0.95, (np.count_nonzero(loose), 1))
