@@ -19,14 +19,14 @@ from cdpipe.core.threads import THREAD_VARIABLES
 
 TOOL = "tunnelcd"
 FORMAT_VERSION = 1
-# Rows depend on these, but for `distributed`, of which a cluster needs one: runs that differ in them are not mixed.
+# Rows depend on these except `distributed`, which all workers of a cluster share; runs that differ are not mixed.
 _PACKAGES = (
     "tunnelcd", "numpy", "scipy", "pandas", "torch", "mujoco", "embreex", "trimesh", "small_gicp", "kiss-matcher",
     "py4dgeo", "dufomap", "pyoctomap", "kiss-icp", "warp-lang", "scikit-image", "pydantic", "matplotlib", "distributed",
 )  # fmt: skip
 # Rows of worlds that are recordings depend on these too: they read the recordings, or estimate their poses.
 _OF_RECORDINGS = ("genz-icp", "ouster-sdk", "pypcd4", "laspy", "lazrs", "pye57", "rosbags")
-# No row depends on these: they show, convert to other formats and store; `distributed` stands for dask.
+# No row depends on these: they show, convert to other formats and store; dask is covered by `distributed`.
 IDLE = ("viser", "rerun-sdk", "mcap", "pyarrow", "mlcroissant", "dask")
 
 

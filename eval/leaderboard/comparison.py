@@ -271,7 +271,7 @@ def _why_none(data: RunData, own: pd.DataFrame) -> str:
     if version == version_name():
         seeds += ": evaluate with --split sealed"
     elif version != split:
-        seeds += f": evaluate with --split sealed:{version.rpartition(' ')[2]}"
+        seeds += f": evaluate with --split sealed:{version.rpartition(' ')[2]}, of a later version by that one"
     return f"{data.folder.path} holds none of these {len(own)} pairs; its pairs are {seeds}"
 
 

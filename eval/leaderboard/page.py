@@ -179,7 +179,7 @@ def _notes(
 def _place(row: Mapping[str, Any]) -> tuple[float, ...]:
     """Return what sorts the best first: F1, which false objects lower, then the others.
 
-    Where nothing changed all of these are NaN: alarms count, which pairs that were refused are too.
+    Where nothing changed these are NaN, and alarms decide; a refused pair counts as one.
     """
     high = (row["object_f1_50"], row["object_iou_point"], row["region_recall"])
     order = (*(-value for value in high), row["is_alarm"], row["false_regions_per_100m"])

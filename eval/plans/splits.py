@@ -19,7 +19,8 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.names import visible
 from cdpipe.core.yamlfile import Settings, read_yaml, validate
 
-_SEALED = re.compile(r"sealed(?::(\d{1,9}(?:\.\d{1,9}){0,3}))?")
+_NUMBER = "(?:0|[1-9][0-9]{0,8})"
+_SEALED = re.compile(rf"sealed(?::({_NUMBER}\.{_NUMBER}\.{_NUMBER}))?")
 
 
 class Split(Settings):

@@ -97,6 +97,13 @@ class Targets(Settings):
     surface: tuple[Target, ...] = ()
     merge: dict[PairKind, Annotated[float, Field(gt=0, le=1)]] = Field(default_factory=dict)
 
+    @model_validator(mode="after")
+    def _has_odometry(self) -> Targets:
+        named = [each.name for each in (*self.regions, *self.objects, *self.surface) if each.odometry]
+        if named and not self.odometry:
+            raise ValueError(f"odometry of {named[0]}: the targets name none that the other figures are of")
+        return self
+
     def share(self, pair_kind: str) -> float | None:
         """Return which share of the pairs of a kind must do what it asks for; None where no target is set."""
         return {str(kind): value for kind, value in self.merge.items()}.get(pair_kind)

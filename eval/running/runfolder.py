@@ -272,6 +272,8 @@ def keep_makers(now: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str,
             the tables now go under "tables".
     """
     made = {name: earlier[name] for name in _OF_THE_MAKING if name in earlier}
+    if "versions" in made:  # runs of before did not record extras, and those of today made no cell
+        now = {name: value for name, value in now.items() if name != "extras"}
     tables = {name: now[name] for name in ("git_commit", "versions") if made.get(name, now[name]) != now[name]}
     return {**now, **made, **({"tables": tables} if tables else {})}
 

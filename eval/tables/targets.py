@@ -133,7 +133,9 @@ def _less_rival(target: Target, variant: str, table: pd.DataFrame) -> dict[str, 
     ours, theirs = (_of_table(target, name, table) for name in (variant, target.less))
     if ours is None or theirs is None:
         return None
-    return {**ours, "value": ours["value"] - theirs["value"], "low": math.nan, "high": math.nan}
+    # who misses whatever its value is behind: a limit that is undefined, errors of a field that measures nothing
+    theirs_value = math.inf if theirs["is_missed"] else theirs["value"]
+    return {**ours, "value": ours["value"] - theirs_value, "low": math.nan, "high": math.nan}
 
 
 def _on_site(target: Target, variant: str, results: pd.DataFrame) -> dict[str, Any]:

@@ -66,7 +66,7 @@ def _require_padded(folder: Path, files: list[Path]) -> None:
 
 
 def _by_number(file: Path) -> list[int | str]:
-    return [int(part) if part.isdigit() else part for part in _NUMBERS.split(file.name)]
+    return [int(part) if part.isdecimal() else part for part in _NUMBERS.split(file.name)]
 
 
 def _find_poses(folder: Path, scans: Path, name: str) -> Trajectory | None:
@@ -180,7 +180,7 @@ class E57Scans:
         if not 0 < len(self) <= _MOST_SCANS:
             raise InputError(f"{path}: {len(self)} scans: expected 1 to {_MOST_SCANS}")
         self.own: Trajectory | None = None if has_poses else self._make_poses(poses)
-        if self.own is None and path.is_dir():
+        if has_poses and path.is_dir():
             _require_padded(path, sorted(files))
 
     def _make_poses(self, poses: list[list[float] | None]) -> Trajectory | None:

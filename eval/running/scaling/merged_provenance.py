@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import Any
 
 from cdpipe.core.errors import InputError
@@ -34,8 +35,8 @@ def unite_provenance(
     Raises:
         InputError: Two of them differ in what rows depend on.
     """
-    for name, other in zip(names[1:], told[1:], strict=True):
-        _require_alike(names[0], told[0], name, other)
+    for (name, one), (other_name, other) in combinations(zip(names, told, strict=True), 2):
+        _require_alike(name, one, other_name, other)
     parts = [part for name, each in zip(names, told, strict=True) for part in _parts(name, each)]
     commits = list(dict.fromkeys(str(each.get("git_commit")) for each in told))
     notes = [] if len(commits) == 1 else [f"the runs are of several commits: {', '.join(commits)}"]

@@ -13,7 +13,7 @@ from tests.eval.running.runs import load_small
 
 @pytest.fixture(scope="module")
 def thinned() -> Iterator[None]:
-    """Thin out every world that the bench draws."""
+    """Thin out the worlds that these modules draw."""
     with pytest.MonkeyPatch.context() as patch:
         for module in (merge, profile, whole, dataset):
             patch.setattr(module, "load_scenario", load_small)

@@ -9,7 +9,8 @@ from packaging.requirements import Requirement
 
 from cdpipe.core.errors import InputError
 from eval.core import provenance
-from eval.running.scaling.merged_provenance import resume_provenance
+from eval.running.runfolder import keep_makers
+from eval.running.scaling.merged_provenance import resume_provenance, unite_provenance
 
 NOW = provenance.describe_run({"seeds": [1]}, {}, {}, ["run"], None, "")
 
@@ -42,3 +43,18 @@ def test_extras_count_where_rows_depend_on_them() -> None:
         earlier = {**NOW, "extras": {**NOW["extras"], name: "0.0"}}
         with pytest.raises(InputError, match=f"{name}: '0.0' and ") if is_refused else nullcontext():
             resume_provenance("run", earlier, NOW)
+
+
+def test_each_run_is_compared_with_each_other() -> None:
+    older = {name: value for name, value in NOW.items() if name != "extras"}  # it agrees with both
+    told = [{**older, "started": "1"}, *({**NOW, "started": "1", "extras": {"genz-icp": each}} for each in ("1", "2"))]
+    with pytest.raises(InputError, match=r"^b and c: of different .*genz-icp: '1' and '2'"):
+        unite_provenance(["a", "b", "c"], told, "merge-runs")
+    assert unite_provenance(["a", "b"], told[:2], "merge-runs")[0]["parts"]
+
+
+def test_packages_of_today_did_not_make_the_cells_of_an_earlier_run() -> None:
+    older = {name: value for name, value in NOW.items() if name != "extras"}
+    assert "extras" not in keep_makers(NOW, older)
+    assert keep_makers(NOW, {**NOW, "extras": {"laspy": "0"}})["extras"] == {"laspy": "0"}
+    assert keep_makers(NOW, {})["extras"] == NOW["extras"]

@@ -63,7 +63,8 @@ def test_the_seeds_of_an_earlier_version_can_be_had_and_those_of_a_later_one_not
     sealed = change_plan(plan, split="sealed:0.1.0")
     assert sealed.split == "sealed by tunnelcd 0.1.0"
     assert sealed.seeds == seal_seeds(plan.seeds, "tunnelcd 0.1.0") != change_plan(plan, split="sealed").seeds
-    for split, told in (("sealed:99.0.0", "it or an earlier one"), ("seald", "dev, sealed or"), ("sealed:x", "dev, s")):
+    wrong = ("seald", "sealed:x", "sealed:0.1", "sealed:0.1.00", "sealed:0.1.0.0", "sealed:")
+    for split, told in (("sealed:99.0.0", "it or an earlier one"), *((each, "dev, sealed or") for each in wrong)):
         with pytest.raises(InputError, match=f"^--split {split}: .*{told}"):
             change_plan(plan, split=split)
 

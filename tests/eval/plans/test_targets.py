@@ -67,6 +67,7 @@ def test_a_run_of_an_unknown_plan_has_none() -> None:
         ({"regions": [{"column": "region_auroc", "name": "a", "at_least": 1, "less": "c2c"}]}, "less"),
         ({"objects": [{"column": "a", "name": "a", "at_least": 1, "sensor": "b", "domain": "in"}]}, "domain, site and"),
         ({"objects": [{"column": "a", "name": "a", "at_least": 1, "sensor": "b", "odometry": "c"}]}, "odometry: for a"),
+        ({"objects": [{"column": "a", "name": "a", "at_least": 1, "odometry": "drift"}]}, "odometry of a: the targets"),
         ({"objects": [{"column": "a", "name": "a", "at_least": 1, "less_sensor": "b"}]}, "less_sensor: for a target"),
         ({"merge": {"clean": 1.1}}, "less than or equal to 1"),
     ],

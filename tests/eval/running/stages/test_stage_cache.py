@@ -228,7 +228,7 @@ def test_times_and_whether_they_were_shared_belong_to_the_stage(pair: Path, tmp_
 
 
 @pytest.mark.parametrize(("is_shared", "n_calls"), [(True, 1), (False, 1 + pair_stages.REPEATS)])
-def test_workers_call_every_stage_once(
+def test_workers_call_a_stage_once_and_a_run_alone_repeats_it(
     pair: Path, calls: Counter[str], monkeypatch: pytest.MonkeyPatch, is_shared: bool, n_calls: int
 ) -> None:
     monkeypatch.setattr(pair_stages, "REPEAT_BELOW_S", np.inf)  # as if no stage took a second

@@ -184,3 +184,15 @@ def test_a_bound_may_be_on_another_odometry_and_on_what_is_less_than_a_rival() -
     assert list(judged["target"]) == ["less", "drift", "both"]
     assert list(judged["value"]) == pytest.approx([-0.006, 0.002, 0.001])
     assert list(judged["is_met"]) == [True, False, False]
+
+
+def test_a_rival_without_a_limit_is_behind() -> None:
+    results = pd.DataFrame([case(seed, variant=variant) for variant in ("ours", "c2c") for seed in (1, 2)])
+    rows = [{**row, "variant": variant} for row in null_windows() for variant in ("ours", "c2c")]
+    answered = {"ours": 0.03, "c2c": 0.0}
+    rows += [{**window(0.04, value, seed), "variant": name} for name, value in answered.items() for seed in (1, 2)]
+    bound = {"column": "surface_limit_1m2_m", "name": "limit", "at_most": 0}
+    for method, rival, is_met in (("ours", "c2c", True), ("c2c", "ours", False)):
+        targets = Targets(method=method, surface=({**bound, "less": rival},))
+        (row,) = surface_tables(results, pd.DataFrame(rows), targets)["surface_targets"].to_dict("records")
+        assert row["is_met"] is is_met
