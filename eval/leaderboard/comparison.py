@@ -249,10 +249,13 @@ def _notes(
 
 def note_other_worlds(results: pd.DataFrame, references: Sequence[RunData]) -> Iterator[str]:
     """Yield sentences about runs whose pairs are, or may be, others than those of the same name that were answered."""
-    pairs, commits = set(zip(results["scenario"], results["seed"], strict=True)), set(texts(results, "commit"))
+    pairs = set(zip(results["scenario"], results["seed"], strict=True))
+    # answers of others state no commit: nothing tells then which one simulated their pairs
+    commits = set(texts(results, "commit")) - {""}
     for data in references:
         rows = [row for row in data.results if (row["scenario"], row["seed"]) in pairs]
-        if others := sorted({text(row, "commit")[:7] for row in rows if text(row, "commit") not in commits}):
+        others = sorted({text(row, "commit")[:7] for row in rows if text(row, "commit") not in commits})
+        if commits and others:
             told = ", ".join(other or "an unknown one" for other in others)
             yield (
                 f"rows of {data.folder.path.name} are of commit {told}: sessions differ where the simulator has "
