@@ -45,8 +45,7 @@ def open_session(path: str | Path, how: HowToRead | None = None, report: Progres
     path, how = Path(path), how or HowToRead()
     name = how.format or guess_format(path)
     if name == "session":
-        if how != HowToRead(format=how.format):
-            raise InputError(f"{path}: a session has its own poses and sensor: leave --trajectory and the like out")
+        how.require_nothing(path, "a session has its own poses and sensor")
         return RecordedScans(read_session(path))
     source = _open_ouster(path, how, report) if name in OUSTER else open_recording(path, how, report)
     own = path if path.is_dir() else path.with_name(f"{path.name}.tunnelcd")

@@ -137,6 +137,7 @@ def tell_recordings(
             f"{len(paths)} recordings: expected one, which is split, two of one place, or --recording NAME"
         )
     hows = how_to_read(len(paths), form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin)
+    guess_formats(paths, hows)  # which refuses options that none of them has a use for
     told: dict[str, Any] = {"sessions": [str(path) for path in paths], "format": form, "topics": list(topics or ())}
     for name, option, files in (
         ("trajectories", "trajectory", [how.trajectory for how in hows]),
@@ -196,12 +197,12 @@ def open_sources(*inputs: Path | ScanSource) -> list[ScanSource]:
 def _check_sessions(paths: Sequence[Path], hows: Sequence[HowToRead]) -> list[HowToRead | None]:
     """Return how to read each recording, None for a session folder, which needs no options."""
     from cdpipe.core.errors import InputError
-    from cdpipe.io.foreign import HowToRead
     from cdpipe.io.session import is_session
 
     checked = [None if is_session(path) else how for path, how in zip(paths, hows, strict=True)]
-    if not any(checked) and any(how != HowToRead() for how in hows):
-        raise InputError(f"{paths[0]}: a session has its own poses and sensor: leave --trajectory and the like out")
+    if not any(checked):
+        for path, how in zip(paths, hows, strict=True):
+            how.require_nothing(path, "a session has its own poses and sensor")
     for path, how, kept in zip(paths, hows, checked, strict=True):
         if kept is None and how.trajectory is not None:
             raise InputError(f"{path}: a session has its own poses: give --trajectory {NONE} for it")

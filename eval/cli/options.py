@@ -153,8 +153,8 @@ def join_world_settings(world: Sequence[str] | None, old: Sequence[str] | None) 
     return settings
 
 
-def require_method_settings(settings: Sequence[str] | None, way: str = _TO_SIMULATE) -> None:
-    """Refuse settings of a world where those of a method are expected.
+def require_method_settings(settings: Sequence[str] | None, way: str = _TO_SIMULATE, option: str = "set") -> None:
+    """Refuse settings of a world where those of a method are expected, given by an option.
 
     Raises:
         InputError: One is of a world.
@@ -164,7 +164,7 @@ def require_method_settings(settings: Sequence[str] | None, way: str = _TO_SIMUL
 
     for setting in settings or ():
         if _group(setting) in Scenario.model_fields.keys() - PipelineConfig.model_fields.keys():
-            raise InputError(f"--set {setting}: a setting of the world, not of a method: {way}")
+            raise InputError(f"--{option} {setting}: a setting of the world, not of a method: {way}")
 
 
 @contextmanager

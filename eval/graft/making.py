@@ -15,7 +15,7 @@ from cdpipe.io.foreign import HowToRead, guess_format
 from cdpipe.io.foreign.sniff import OUSTER
 from cdpipe.io.known_merge import read_known_merge
 from cdpipe.io.readers import RecordedScans, import_ouster, open_session
-from cdpipe.io.session import ScanChunk, Session, read_session
+from cdpipe.io.session import ScanChunk, Session, is_session, read_session
 from cdpipe.model.config import load_config
 from cdpipe.pipeline import Hooks, detect_merge, map_pair
 from eval.core.output import new_folder
@@ -86,6 +86,10 @@ def open_recorded(recording: Recording, on_progress: Progress = report_nothing) 
 
 
 def _how(recording: Recording, number: int) -> HowToRead:
+    """Return how to read a recording; options are for the others where it is a session and one of them is none."""
+    are_sessions = [is_session(Path(name)) for name in recording.sessions]
+    if are_sessions[number] and not all(are_sessions) and not recording.trajectories:
+        return HowToRead()
     trajectory = Path(recording.trajectories[number]) if recording.trajectories else None
     metadata = Path(recording.metadata[number]) if recording.metadata else None
     told = recording.format, recording.topics, trajectory, recording.odometry, metadata, recording.deskew

@@ -69,6 +69,21 @@ class HowToRead:
         if self.odometry is not None and self.trajectory is not None:
             raise InputError("--trajectory and --odometry both give the poses: leave one out")
 
+    def require_nothing(self, path: str | Path, why: str) -> None:
+        """Refuse options where they have no use; the format `session` says of a session what it is.
+
+        Raises:
+            InputError: One is given.
+        """
+        values = {
+            "format": None if self.format == "session" else self.format, "topic": self.topics,
+            "trajectory": self.trajectory, "odometry": self.odometry, "metadata": self.metadata,
+            "no-deskew": not self.deskew, "origin": any(self.origin_m),
+        }  # fmt: skip
+        for name in (name for name, value in values.items() if value):
+            again = ": it is subtracted where a recording becomes a session: convert that again" if name == "origin" else ""
+            raise InputError(f"{path}: {why}: leave --{name} out{again}")
+
     def subtracted_m(self, path: Path) -> tuple[float, float, float]:
         """Return what is subtracted from the positions of a recording: nothing from a session or estimated poses."""
         return (0.0, 0.0, 0.0) if is_session(path) or self.odometry is not None else self.origin_m

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 _FEW_SCANS = 10
 _CELL_M = 0.05
-_ORIGIN = "it is subtracted where a recording becomes a session: convert that again"
 _ANSWER = 3  # inputs of an answer's map: before, after, answer
 
 
@@ -95,8 +94,8 @@ def convert(
             return
         source = sources[0]
         if _is_world(source, out, to):
-            if hows != [HowToRead()]:
-                raise InputError(f"{source}: a world has no recording to read: leave --trajectory and the like out")
+            for how in hows:
+                how.require_nothing(source, "a world has no recording to read")
             with world_mistakes():
                 say(quiet, _convert_world(source, out, to, seed, asked, with_truth=with_truth))
             return
@@ -163,19 +162,15 @@ def _is_session(source: Path, how: HowToRead) -> bool:
         InputError: It is a pair, an answer, or a session with options of a recording.
     """
     from cdpipe.core.errors import InputError
-    from cdpipe.io.foreign import HowToRead
     from cdpipe.io.session import is_session
 
     if (source / "answer.json").is_file():
         raise InputError(f"{source}: an answer, without its sessions: `tunnelcd convert BEFORE AFTER {source} map.laz`")
     if is_session(source / "before"):
         raise InputError(f"{source}: a pair of sessions: convert {source / 'before'} and {source / 'after'} one by one")
-    if is_session(source) and how != HowToRead():
-        given: dict[str, object] = {"metadata": how.metadata, "trajectory": how.trajectory, "odometry": how.odometry}
-        given |= {"format": how.format, "topic": how.topics or None, "no-deskew": None if how.deskew else True}
-        name = next((name for name, value in given.items() if value is not None), "origin")
-        meant = {"format": " (the format that is written is --to)", "origin": f": {_ORIGIN}"}.get(name, "")
-        raise InputError(f"{source}: a session has its own poses and sensor: leave --{name} out{meant}")
+    if is_session(source):
+        to_write = "" if how.format is None else " (the format that is written is --to)"
+        how.require_nothing(source, f"a session has its own poses and sensor{to_write}")
     return is_session(source)
 
 

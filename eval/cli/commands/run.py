@@ -103,7 +103,8 @@ def run_command(
     from eval.plans.plan import load_plan
     from eval.running.scaling.shards import parse_shard
 
-    require_method_settings([*(settings or ()), *(grid or ())], "write it into the plan, as `set` of a scenario")
+    for option, given in (("set", settings), ("grid", grid)):
+        require_method_settings(given, "write it into the plan, as `set` of a scenario", option)
     chosen = change_plan(
         load_plan(plan), seeds=seeds, split=split, presets=preset or (), settings=settings or (), grid=grid or ()
     )

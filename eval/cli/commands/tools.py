@@ -63,19 +63,21 @@ def bench(
     from eval.core.terminal.progress import Lines, Silent
 
     _require_one_table(growth=growth, profile=profile, surface=surface, quick=quick, large=large)
+    contests = choose(list_contests(), only or ()) if not growth and not profile else {}
+    axes = choose_axes(only or ()) if growth else []
     if out is not None:
         require_writable(out, growth=growth, profile=profile)
     # lines, never bars: the time of a thread that redraws bars would be measured as well
     tell = (Silent() if quiet else Lines()).cells
     written: list[Path] = []
     if growth:
-        table = measure_growth(choose_axes(only or ()), quick=quick, large=large, on_progress=tell)
+        table = measure_growth(axes, quick=quick, large=large, on_progress=tell)
         written = [] if out is None else write_growth(table, out)
     elif profile:
         table = measure_profile(only or SITES, has_surface=surface, on_progress=tell)
         written = [] if out is None else [write_markdown(table, out)]
     else:
-        table = measure(choose(list_contests(), only or ()), tell)
+        table = measure(contests, tell)
     written = [*([] if out is None else [out]), *written]
     tell_json(table, as_json=as_json, file=out)
     show = _print_growth if growth else _print_profile if profile else _print_speed

@@ -252,8 +252,8 @@ def load_view(
     if is_pair(path) or is_session(path) or (is_named and what not in names):
         if seed is not None or settings:
             raise InputError(f"{what}: a folder holds what was recorded: leave --seed and --world out")
-        if (is_pair(path) or is_session(path)) and how != HowToRead():
-            raise InputError(f"{what}: a session has its own poses and sensor: leave --trajectory and the like out")
+        if is_pair(path) or is_session(path):
+            how.require_nothing(what, "a session has its own poses and sensor")
         if is_pair(path) or is_session(path) or (path.is_dir() and not holds_scans(path)):
             return view_folder(path)
         (source,) = open_sources(*open_inputs([path], [how], progress or RunProgress()))
@@ -261,6 +261,5 @@ def load_view(
     if what not in names and path.suffix not in SUFFIXES:
         hint = suggest(what, names) or "; `tunnelcd list` names the scenarios"
         raise InputError(f"{what}: neither a folder nor a scenario{hint}")
-    if how != HowToRead():
-        raise InputError(f"{what}: a world has no recording to read: leave --trajectory and the like out")
+    how.require_nothing(what, "a world has no recording to read")
     return view_scenario(load_scenario(what, seed or 0, settings), seed or 0)

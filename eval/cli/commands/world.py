@@ -141,11 +141,14 @@ def survey(
     from cdpipe.core.errors import InputError
     from eval.core.output import make_writable, require_replaceable
     from eval.plans.seeds import parse_seeds_option
+    from scenarios import load_scenario
     from sim.studies import survey as surveys
     from sim.studies.survey import markdown as as_markdown
     from sim.studies.survey import summary, write_csv
 
     numbers = parse_seeds_option(seeds)
+    for family in families:
+        load_scenario(family, numbers[0])  # before a folder is made
     if out is not None:
         make_writable(out.absolute().parent)
         require_replaceable(out, b"family,seed,before_path_m", "table of `tunnelcd survey`")

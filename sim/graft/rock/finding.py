@@ -78,7 +78,7 @@ def _find_place(
     told = ", ".join(f"{count} times {why}" for why, count in counted) or "nothing was recorded within reach"
     raise ScenarioError(
         f"surface {change.name!r} finds no place in {sum(reasons.values())} tries ({told}): make it smaller, graft "
-        "less, raise reach_m of the recording, or give place.at"
+        "less, raise reach_m (--reach) of the recording, or give place.at"
     )
 
 
