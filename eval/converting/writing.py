@@ -98,7 +98,9 @@ def write_world(what: str, out: Path, name: str, seed: int | None, settings: Seq
     if is_pair(pair) and not with_truth:
         raise InputError(f"{pair}: the world of a pair is its truth: add --with-truth")
     if with_truth and not is_pair(pair):
-        raise InputError(f"{what}: a scenario has no sessions that could be without their truth: leave --with-truth out")
+        raise InputError(
+            f"{what}: a scenario has no sessions that could be without their truth: leave --with-truth out"
+        )
     if is_pair(pair) and (seed is not None or settings):
         raise InputError(f"{pair}: a folder holds what was simulated: leave --seed and --world out")
     with _output(out, form) as partial:

@@ -28,6 +28,8 @@ from eval.leaderboard.comparison import (
 )
 from eval.leaderboard.reference import find_reference
 from eval.leaderboard.submission import CheckedFile
+from eval.plans.files import plan_names
+from eval.plans.plan import load_plan
 from eval.report.render import render_page, write_file
 from eval.running.results.run_data import RunData
 
@@ -116,7 +118,7 @@ def _make_boards(group: Sequence[CheckedFile], reference: Path | None) -> Iterat
     """Yield a table for each kind of pairs (`part_pairs`); the notes stand below the last."""
     first = group[0].content
     data = find_reference(first.plan, reference)
-    own = {each.content.name: take_figures(_rows(each)) for each in group}
+    own = {each.content.name: take_figures(take_rows(each)) for each in group}
     merges = {} if data is None else {name: _MERGES[merge] for name, merge in list_merges(data.folder).items()}
     parts = part_pairs(own[first.name])
     for part, pairs in parts.items():
@@ -136,8 +138,11 @@ def _make_boards(group: Sequence[CheckedFile], reference: Path | None) -> Iterat
         yield Board(", ".join(told), tuple(_line(*row) for row in rows), tuple(notes))
 
 
-def _rows(each: CheckedFile) -> pd.DataFrame:
-    return pd.DataFrame([pair.row for pair in each.content.pairs])
+def take_rows(each: CheckedFile) -> pd.DataFrame:
+    """Return the rows of a submission, with the kinds of pairs that a shipped plan says: a kind may allow to refuse."""
+    name = each.content.plan
+    kinds = {world.label: world.pair_kind for world in load_plan(name).worlds} if name in plan_names() else {}
+    return pd.DataFrame([{**pair.row, "pair_kind": kinds.get(pair.scenario, "")} for pair in each.content.pairs])
 
 
 def _list_references(data: RunData | None, pairs: pd.Index[Any]) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -164,7 +169,7 @@ def _notes(
         yield f"No reference rows: {where}."
     elif any(row["n_pairs"] < n_pairs for row in references):
         yield "A reference row with fewer pairs is a mean over those alone."
-    yield from note_other_worlds(pd.concat(map(_rows, group)), [] if data is None else [data])
+    yield from note_other_worlds(pd.concat(map(take_rows, group)), [] if data is None else [data])
     digests: dict[tuple[str, int], str] = {}
     for each in group:
         differing = [

@@ -65,7 +65,7 @@ def pareto_table(data: RunData) -> pd.DataFrame:
 
     Returns:
         A row for each quality, cost, domain and variant: `n_pairs`, of which `n_quality` and `n_cost` have the number;
-        `quality_value` with its 95 % interval `low` to `high` over session pairs; `cost_value` (seconds, bytes);
+        `quality_value` with its 95 % interval `low` to `high` over tunnels; `cost_value` (seconds, bytes);
         `is_on_front`. No row where fewer than two methods have both.
     """
     results = comparable(data)

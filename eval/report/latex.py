@@ -17,6 +17,7 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.core.names import visible
+from eval.core.statistics import ENOUGH_PAIRS
 from eval.core.terminal.printing import count_pairs
 from eval.report.comparing.columns import COMPARED
 from eval.report.comparing.differences import is_told_apart
@@ -156,8 +157,8 @@ def _caption(words: str, data: RunData, results: pd.DataFrame) -> str:
     beside_work = " Times were measured beside other work." if is_contended(data) else ""
     return (
         f"{told}, {failed if n_failed else 'every case answered'}.{beside_work} In small type: 95 % bootstrap "
-        f"intervals over session pairs. Bold: the best of its group as written; †: not told from it by the "
-        "paired difference over session pairs, or by fewer than six pairs."
+        f"intervals over tunnels. Bold: the best of its group as written; †: not told from it by the paired "
+        f"difference over session pairs, or by fewer than {ENOUGH_PAIRS} tunnels."
     )
 
 

@@ -48,7 +48,7 @@ def draw_scenarios(data: RunData) -> list[Chart]:
         rows.append([Panel(x, Axis(column.heading, (0.0, 1.05)), series)])
     caption = (
         "Means over the n session pairs of each scenario, 0 for a pair without an answer (AUROC: 0.5); bars: 95 % "
-        "interval over pairs. A click on a name hides a method, two show it alone."
+        "interval over tunnels. A click on a name hides a method, two show it alone."
     )
     if n_methods > len(methods):
         caption += f" The {len(methods)} best by F1 of {n_methods} methods; results.csv has all."

@@ -44,8 +44,7 @@ HEADLINES = select(
     COMPARED, POOLED, "region_recall", "region_auroc", "false_regions_per_100m", "is_alarm", "object_iou_point",
     "object_f1_50", "merge_error_m", "t_total_s", "bytes_regions_before",
 )  # fmt: skip
-
-
+_ALARMS = ("is_alarm", "false_regions_per_100m")
 SURFACE_HEADLINES = select(
     SURFACE_COLUMNS, "surface_cover", "surface_error_median_changed_m", "surface_level_inside", "surface_recall",
     "surface_region_precision", "surface_false_regions_per_100m", *map(limit_column, AREAS_M2), "t_surface_s",
@@ -146,8 +145,10 @@ def rank_methods(data: RunData) -> tuple[pd.DataFrame, list[Column], pd.DataFram
         names = ["domain", "variant"]
         table = table.drop(columns=pooled.columns.difference(names)).merge(pooled, on=names, how="left")
     shown = [column for column in HEADLINES if table[column.key].notna().any()]
-    # higher is better, as written; what is undefined comes last
+    # by what is better if higher, then by false alarms, as written; what is undefined comes last
     ranks = {column.key: -table[column.key].round(2).fillna(-math.inf) for column in shown if column.better == "high"}
+    alarms = [column.key for column in shown if column.key in _ALARMS]
+    ranks |= {key: table[key].round(2).fillna(math.inf) for key in alarms}
     order = pd.DataFrame({"domain": table["domain"], "oracle": table["variant"].map(is_told_the_truth), **ranks})
     return table.loc[order.sort_values(["domain", "oracle", *ranks], kind="stable").index], shown, figures
 

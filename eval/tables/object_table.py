@@ -111,6 +111,7 @@ def _counts(own: pd.DataFrame, changes: pd.DataFrame) -> dict[str, Any]:
         "n_pairs": len(own),
         "n_refused": int((own["status"] == "merge_refused").sum()),
         "n_failed": count_failed(own),
+        "n_observable": int(np.nansum(numbers(own, "n_observable"))),
         "n_changes": len(main_changes(changes)),
         "n_partial": int(np.nansum(numbers(own, "n_partial"))),
         "n_matched": int((numbers(main_changes(changes), "matched_object") >= 0).sum()),

@@ -17,7 +17,7 @@ from eval.core.statistics import interval_over_tunnels, mean_with_interval, medi
 from eval.plans.targets import PROPOSED, RATE_COLUMN, SURFACE_COLUMN, Target, Targets
 from eval.tables.conditions import ANY, by_condition, odometry_of, of_condition
 from eval.tables.regions.curves import RankedPairs, recall_difference
-from eval.tables.rows import numbers, records, texts, tunnels_of
+from eval.tables.rows import numbers, records, texts, tunnel_numbers, tunnels_of
 
 COLUMNS = ("target", "domain", "variant", "value", "low", "high", "asked", "n", "is_met")
 # what a column is over, where that is not every pair of its row
@@ -166,7 +166,9 @@ def _with_sensor(target: Target, variant: str, results: pd.DataFrame, odometry: 
     values = of_pairs(target.sensor)
     if target.less_sensor:
         values = (values - of_pairs(target.less_sensor)).dropna()
-    value, low, high, n = mean_with_interval(np.asarray(values, dtype=np.float64))
+    value, _, _, n = mean_with_interval(values.to_numpy(dtype=np.float64))
+    tunnels = tunnel_numbers(values.index.get_level_values(0), values.index.get_level_values(1))
+    low, high = interval_over_tunnels(values.to_numpy(dtype=np.float64), tunnels)
     return {"domain": target.sensor, "value": value, "low": low, "high": high, "n": n}
 
 

@@ -74,7 +74,6 @@ def convert(
     BEFORE AFTER ANSWER become one map with scalar fields, .laz or .ply. A scenario becomes a .glb.
     """
     from cdpipe.core.errors import InputError
-    from cdpipe.io.foreign import HowToRead
 
     if len(sources) not in (1, _ANSWER):
         raise InputError(f"{len(sources)} inputs: expected one, or BEFORE AFTER ANSWER, and then the output")

@@ -29,7 +29,8 @@ COMPARED = (
            "anew in every draw of pairs.", "Undefined without regions.csv and changes.csv."),
     *select(RESULT_COLUMNS, "region_auroc", "false_regions_per_100m"),
     Column("is_alarm", "alarm or no answer where nothing changed", "low", share,
-           "Share of the unchanged pairs with a reported region, or without an answer where refusing is never right."),
+           "Share of the unchanged pairs with a reported region or object, or without an answer where refusing is "
+           "never right."),
     *select(RESULT_COLUMNS, "object_iou_point"),
     Column("object_iou_voxel", "object voxel IoU", "high", share, "The same with 0.1 m voxels, mean over 8 grids."),
     *select(RESULT_COLUMNS, "object_f1_50", "kind_accuracy", "merge_error_m", "merge_error_deg"),
@@ -65,10 +66,10 @@ def figures_of(results: pd.DataFrame) -> pd.DataFrame:
     results = without_costs_of_failures(results)
     stored = [column.key for column in COMPARED if column.key not in (*columns, POOLED) and column.key in results]
     figures = {**columns, **{key: _as_numbers(results, key) for key in stored}}
-    if (
-        "is_alarm" in stored and "is_unchanged_pair" in results
-    ):  # who refuses the pairs on which he would cry wolf is not silent
-        figures["is_alarm"] = np.where(is_unchanged_pair(results) & (answered == 0), 1.0, figures["is_alarm"])
+    if "is_alarm" in stored and "is_unchanged_pair" in results:
+        # who refuses the pairs on which he would cry wolf is not silent, nor is who answers objects without regions
+        cries = (answered == 0) | (numbers(results, "n_objects") > 0)
+        figures["is_alarm"] = np.where(is_unchanged_pair(results) & cries, 1.0, figures["is_alarm"])
     return pd.DataFrame(figures)
 
 

@@ -16,13 +16,15 @@ import pandas as pd
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int64Array
 from eval.core.statistics import ENOUGH_PAIRS, paired_difference
+from eval.plans.targets import read_targets
 from eval.report.comparing.columns import COMPARED, figures_of, is_time
 from eval.report.pooled import POOLED, POOLED_RATE_PER_100M, rank_pairs
 from eval.running.results.run_data import RunData
 from eval.running.results.sides import Side, check_extras, check_versions, matched_variants
 from eval.tables.columns import Column
+from eval.tables.conditions import Condition, by_condition
 from eval.tables.regions.curves import recall_at, recall_difference
-from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, numbers, tunnels_of, with_pair
+from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, numbers, stated, tunnels_of, with_pair
 
 BETTER, WORSE, NOISE = "better", "worse", "no difference beyond noise"
 SAME, TOO_FEW, NOT_JUDGED = "the same", "too few pairs", "not judged"
@@ -44,10 +46,11 @@ def compare(a: Side, b: Side, *, times_count: bool = True, seed: int = 0) -> pd.
 
     Returns:
         One row for each scenario and each domain, variant and figure with a number on both sides: `scope` ("domain",
-        "scenario"); `where`, its name, `all` for both domains; `variant_a`, `variant_b`; `metric`; `good`, the
+        "scenario"); `where`, its name, `all` for both domains, which are of the pairs with the odometry and the sensor
+        of A's plan where the sides share any; `variant_a`, `variant_b`; `metric`; `good`, the
         direction; `n_pairs` that both sides have, `n_used` of them with a number on both, `n_only_a` and `n_only_b`
         with one on one side only; `mean_a`, `mean_b` over the used ones, their `difference` (b - a), its 95 % interval
-        `low` to `high` over session pairs; `verdict` on B. Pooled recall has the recalls in place of means.
+        `low` to `high` over tunnels; `verdict` on B. Pooled recall has the recalls in place of means.
 
     Raises:
         InputError: The sides share no session pair, or their metrics versions differ.
@@ -55,14 +58,15 @@ def compare(a: Side, b: Side, *, times_count: bool = True, seed: int = 0) -> pd.
     check_versions(a, b)
     check_extras(a)
     check_extras(b)
+    of_plan = _pairs_of_plan(a)
     unmade = [set(_pairs(side.results)) - set(_pairs(with_pair(side.results))) for side in (a, b)]
     figures = [figures_of(_without(side.results, unmade[0] & unmade[1])) for side in (a, b)]
     rows: list[dict[str, Any]] = []
     for variants in matched_variants(a, b):
         own = [frame[frame["variant"] == name] for frame, name in zip(figures, variants, strict=True)]
-        for scope, where, pairs in _groups(*own):
+        for scope, where, pairs in _groups(*own, of_plan):
             names = {"scope": scope, "where": where, "variant_a": variants[0], "variant_b": variants[1]}
-            first, second = (frame.set_index(PAIR).loc[pairs] for frame in own)
+            first, second = (_stated(frame.set_index(PAIR).loc[pairs]) for frame in own)
             found = paired_differences(first, second, seed)
             if scope == "domain":
                 found += pooled_difference((a, b), variants, pairs, seed)
@@ -75,6 +79,24 @@ def compare(a: Side, b: Side, *, times_count: bool = True, seed: int = 0) -> pd.
         row["verdict"] = verdict(row) if is_judged else NOT_JUDGED
     rows.sort(key=_place)
     return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def condition_compared(side: Side) -> Condition | None:
+    """Return the odometry and sensor that domains are compared over; None where the plan of a side tells none apart."""
+    conditions = by_condition(side.results, read_targets(side.data.provenance))
+    return conditions[0][0] if len(conditions) > 1 else None
+
+
+def _pairs_of_plan(side: Side) -> pd.MultiIndex:
+    """Return the pairs that the figures of a side's plan are of, by odometry and sensor (`by_condition`)."""
+    _, is_its = by_condition(side.results, read_targets(side.data.provenance))[0]
+    return _pairs(side.results[is_its])
+
+
+def _stated(figures: pd.DataFrame) -> pd.DataFrame:
+    """Return the figures of a method; of a cost that an answer leaves out NaN for all."""
+    costs = [column.key for column in COMPARED if column.key in figures]
+    return figures.assign(**{key: stated(figures, key) for key in costs})
 
 
 def _pairs(results: pd.DataFrame) -> pd.MultiIndex:
@@ -132,16 +154,18 @@ def verdict(row: Mapping[str, Any]) -> str:
     return BETTER if (low > 0.0) == (row["good"] == "high") else WORSE
 
 
-def _groups(a: pd.DataFrame, b: pd.DataFrame) -> list[tuple[str, str, pd.MultiIndex]]:
-    """Return scope, name and the pairs that both sides have, for each domain and each scenario."""
+def _groups(a: pd.DataFrame, b: pd.DataFrame, of_plan: pd.MultiIndex) -> list[tuple[str, str, pd.MultiIndex]]:
+    """Return scope, name and the pairs that both sides have, for each domain (those `of_plan`) and each scenario."""
     pairs = pd.MultiIndex.from_frame(a[PAIR]).intersection(pd.MultiIndex.from_frame(b[PAIR])).sort_values()
     if len(pairs) == 0:
         return []
-    domain_of_pair = a.set_index(PAIR)["domain"].loc[pairs].to_numpy()
+    is_of_plan = pairs.isin(of_plan)
+    main = pairs[is_of_plan] if is_of_plan.any() else pairs
+    domain_of_pair = a.set_index(PAIR)["domain"].loc[main].to_numpy()
     present = [name for name in DOMAINS if (domain_of_pair == name).any()]
-    found = [("domain", name, pairs[domain_of_pair == name]) for name in present]
+    found = [("domain", name, main[domain_of_pair == name]) for name in present]
     if len(present) > 1:
-        found.append(("domain", ALL_DOMAINS, pairs))
+        found.append(("domain", ALL_DOMAINS, main))
     scenario = pairs.get_level_values("scenario")
     return found + [("scenario", str(name), pairs[scenario == name]) for name in scenario.unique()]
 

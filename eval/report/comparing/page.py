@@ -18,7 +18,16 @@ from eval.core.figures import picture_address
 from eval.core.output import make_writable
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.report.comparing.columns import COMPARED
-from eval.report.comparing.differences import BETTER, NOISE, NOT_JUDGED, SAME, TOO_FEW, WORSE, compare
+from eval.report.comparing.differences import (
+    BETTER,
+    NOISE,
+    NOT_JUDGED,
+    SAME,
+    TOO_FEW,
+    WORSE,
+    compare,
+    condition_compared,
+)
 from eval.report.render import render_page, write_file
 from eval.report.settings.effects import effect_chart, signed
 from eval.report.tables import Cell, Picture, Table
@@ -64,7 +73,15 @@ def compare_sides(a: Side, b: Side) -> Comparison:
     """
     table = compare(a, b, times_count=not why_no_times(a, b))
     only = (tuple(only_in(a, b)), tuple(only_in(b, a)))
-    return Comparison(short_names(a, b), table, only, tuple(cautions(a, b)))
+    return Comparison(short_names(a, b), table, only, (*_tell_condition(a), *cautions(a, b)))
+
+
+def _tell_condition(side: Side) -> list[str]:
+    """Return a sentence on the pairs that domains are compared over, where a side's plan tells conditions apart."""
+    condition = condition_compared(side)
+    if condition is None:
+        return []
+    return [f"Domains are compared over pairs with {condition.words} alone; scenarios stand with what they have."]
 
 
 def write_comparison(found: Comparison, folder: Path) -> Path:

@@ -22,7 +22,7 @@ _NOTHING_S = 1e-4
 MERGE_COLUMNS = (
     Column("within_target", "within target", "high", fine,
            "Share of all pairs, refused and failed ones included, that do what their kind asks for; below it the 95 % "
-           "Wilson interval over pairs.", "No target for an oracle."),
+           "Wilson interval over tunnels.", "No target for an oracle."),
     Column("wrong", "wrong, accepted", "low", fine,
            f"Pairs that were accepted with a median error over {RIGHT_M:g} m or {RIGHT_DEG:g} deg, or although the "
            "sessions share no place, where the error is undefined."),

@@ -85,7 +85,7 @@ def budget_areas(budgets: pd.DataFrame) -> Table:
         for place, name in enumerate(names):
             cells = [_area_cell(areas[name][price], is_best=marks[price][place]) for price in _PRICES]
             rows.append((domain_name(domain), (Cell(spaced(name)), *cells)))
-    caption = "What proposals save: mean recall from no budget to the one in the heading; interval: 95 % over pairs"
+    caption = "What proposals save: mean recall from no budget to the one in the heading; interval: 95 % over tunnels"
     return Table(("method", *_AREAS.values()), tuple(rows), caption)
 
 

@@ -55,7 +55,7 @@ def draw_roc(curves: pd.DataFrame, table: pd.DataFrame, main: str) -> Chart | No
 def draw_free_response(curves: pd.DataFrame, table: pd.DataFrame) -> Chart | None:
     """Return recall against false regions per 100 m, a panel for each domain; dots: the methods' own thresholds.
 
-    A rate below 0.01 is drawn at 0.01, the left border.
+    A rate below 0.01 is drawn at 0.01, the left border; lines end at 10, where dots of more are drawn.
 
     Args:
         curves: Rows of froc.csv.
@@ -67,8 +67,9 @@ def draw_free_response(curves: pd.DataFrame, table: pd.DataFrame) -> Chart | Non
         series = [Series([rate, rate], [0.0, 1.03], _LIMIT) for rate in RATES_PER_100M]
         for name, curve in methods.items():
             look, hover = line_of(name), "{x:.3g} false regions per 100 m, recall {y:.3f}"
-            x = np.append(curve["false_regions_per_100m"], _MOST_RATE).clip(_LEAST_RATE, _MOST_RATE)
-            y = np.append(curve["recall"], curve["recall"].iloc[-1])
+            drawn = curve[curve["false_regions_per_100m"] <= _MOST_RATE]
+            x = np.append(drawn["false_regions_per_100m"], _MOST_RATE).clip(_LEAST_RATE, _MOST_RATE)
+            y = np.append(drawn["recall"], drawn["recall"].iloc[-1] if len(drawn) else 0.0)
             series.append(Series(x, y, look, name, "steps", hover=hover))
             own = own_places[(own_places["domain"] == domain) & (own_places["variant"] == name)]
             own = own[own["false_regions_per_100m"].notna()]
@@ -82,8 +83,9 @@ def draw_free_response(curves: pd.DataFrame, table: pd.DataFrame) -> Chart | Non
     rates = " and ".join(f"{rate:g}" for rate in RATES_PER_100M)
     caption = (
         f"Lines: every candidate, reported or not. Dots: the methods' own thresholds. Vertical lines: {rates} false "
-        "regions per 100 m. Rates of 0.01 and less are at the left border. Changed and unchanged pairs "
-        "together; a pair without an answer misses all its changes."
+        "regions per 100 m. Rates of 0.01 and less are at the left border, dots of 10 and more at the right one. "
+        "Changed and unchanged pairs together; a pair without an answer misses all its changes, and counts more false "
+        "regions than it is allowed."
     )
     title = "Changes found against false regions, as the threshold falls"
     return Chart("free_response", title, Drawing([panels], 360), caption, has_png=True) if panels else None

@@ -106,4 +106,4 @@ def silence_table(table: pd.DataFrame) -> Table:
         )
         rows.append((domain_name(str(row["domain"])), cells))
     headings = ("method", "silent", "pairs", "false / 100 m", "km driven")
-    return Table(headings, tuple(rows), "Unchanged pairs: one row is one method; interval: Wilson's 95 % over pairs")
+    return Table(headings, tuple(rows), "Unchanged pairs: one row is one method; interval: Wilson's 95 % over tunnels")

@@ -15,7 +15,7 @@ from eval.core.statistics import ENOUGH_PAIRS
 from eval.plans.worlds import get_group
 from eval.report.drawing.charts import Chart
 from eval.report.drawing.looks import look_of
-from eval.report.tables import Cell, Table
+from eval.report.tables import Cell, Table, beside
 from eval.running.results.run_data import RunData
 from eval.running.results.values import over_pairs, select_rows
 from eval.tables.columns import RESULT_COLUMNS, UNDEFINED, Column, count, select, share
@@ -121,14 +121,15 @@ def _lines(
             by_key = {row["metric"]: row for row in records(own[own["setting"] == setting])}
             found = [(column, by_key.get(column.key)) for column in columns]
             n = max((row["n"] for _, row in found if row is not None), default=0)
-            cells = (Cell(UNDEFINED) if row is None else _cell(column, row) for column, row in found)
+            cells = (Cell(UNDEFINED) if row is None else _cell(column, row, n) for column, row in found)
             yield str(variant), (Cell(setting), Cell(str(n)), *cells)
 
 
-def _cell(column: Column, row: Mapping[str, Any]) -> Cell:
+def _cell(column: Column, row: Mapping[str, Any], n_pairs: int) -> Cell:
     is_clear = row["n"] >= ENOUGH_PAIRS and (row["low"] > 0 or row["high"] < 0)
     low, high = (signed(column, row[end]) for end in ("low", "high"))
-    return Cell(signed(column, row["difference"]), is_clear, "" if math.isnan(row["low"]) else f"{low} to {high}")
+    interval = "" if math.isnan(row["low"]) else f"{low} to {high}"
+    return Cell(signed(column, row["difference"]), is_clear, beside(interval, int(row["n"]), int(n_pairs)))
 
 
 def _chart(name: str, title: str, table: pd.DataFrame, columns: Sequence[Column]) -> Chart:

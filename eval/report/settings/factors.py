@@ -81,7 +81,7 @@ def draw_factors(data: RunData) -> list[Chart]:
                 f"{factor.preset}: {factor.key}",
                 drawing,
                 f"Means over the n = {n} session pairs that every value was run on (times: medians), bars: 95 % "
-                f"interval over pairs.{star}",
+                f"interval over tunnels.{star}",
             )
         )
     return charts

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array, Int64Array
 from eval.core.charts import BLACK, Axis, Drawing, Heat, Look, Panel, Series, named_ticks
 from eval.report.drawing.charts import Chart
 from eval.running.results.grids import GridOf, find_grids
 from eval.running.results.run_data import RunData
-from eval.running.results.values import over_pairs, select_rows
+from eval.running.results.values import Row, defined, over_pairs, select_rows
 from eval.tables.columns import RESULT_COLUMNS, Column, share
 
 _GRID_KEYS = (
@@ -44,9 +44,9 @@ def draw_grids(data: RunData) -> list[Chart]:
                 Chart(
                     f"grid_{place}",
                     _title(grid),
-                    _drawing(grid, tables),
+                    _drawing(data, grid, tables),
                     f"Means over n = {len(seeds)} session pair{'s' if len(seeds) > 1 else ''}, medians for times; the "
-                    "best cell has a frame.",
+                    "best cell over as many pairs as any has a frame.",
                 )
             )
     return found
@@ -67,14 +67,16 @@ def _differing(data: RunData, grid: GridOf) -> dict[Column, Float64Array]:
     return {column: table for column, table in tables.items() if len(np.unique(table[~np.isnan(table)])) > 1}
 
 
-def _drawing(grid: GridOf, tables: Mapping[Column, Float64Array]) -> Drawing:
+def _drawing(data: RunData, grid: GridOf, tables: Mapping[Column, Float64Array]) -> Drawing:
     x, y = (named_ticks(list(grid.values[place])) for place in (1, 0))
     panels = []
     for column, table in tables.items():
         low, high = (0.0, 1.0) if column.key in SHARES else (float(np.nanmin(table)), float(np.nanmax(table)))
         texts = [[column.shown(value) for value in row] for row in table]
         axes = Axis(grid.keys[1], (-0.5, len(x) - 0.5), ticks=x), Axis(grid.keys[0], (-0.5, len(y) - 0.5), ticks=y)
-        panels.append(Panel(*axes, _frames(table, column), column.heading, Heat(table, texts, low, high)))
+        n_pairs = _counts(data, grid, column.key)
+        fair = np.where(n_pairs == n_pairs.max(), table, np.nan)  # over fewer pairs it may be the easy ones
+        panels.append(Panel(*axes, _frames(fair, column), column.heading, Heat(table, texts, low, high)))
     rows = [panels[start : start + N_ACROSS] for start in range(0, len(panels), N_ACROSS)]
     return Drawing(rows, 90 + 26 * len(y))
 
@@ -90,10 +92,16 @@ def _frames(written: Float64Array, column: Column) -> list[Series]:
 
 def _values(data: RunData, grid: GridOf, key: str) -> Float64Array:
     """Return (rows, columns) of a figure's means on a grid as written, NaN where it is undefined or was not run."""
-    own = select_rows(data.results, scenario=grid.scenario)
-    means = [
-        [over_pairs(select_rows(own, variant=grid.points.get((a, b))), key) for b in grid.values[1]]
-        for a in grid.values[0]
-    ]
-    shown = _COLUMNS[key].shown
+    means, shown = [[over_pairs(cell, key) for cell in row] for row in _cells(data, grid)], _COLUMNS[key].shown
     return np.array([[math.nan if math.isnan(mean) else float(shown(mean)) for mean in row] for row in means])
+
+
+def _counts(data: RunData, grid: GridOf, key: str) -> Int64Array:
+    """Return (rows, columns) over how many session pairs a figure's means on a grid are."""
+    return np.array([[len(defined(cell, key)) for cell in row] for row in _cells(data, grid)], dtype=np.int64)
+
+
+def _cells(data: RunData, grid: GridOf) -> list[list[list[Row]]]:
+    """Return the rows of results.csv of every point of a grid."""
+    own = select_rows(data.results, scenario=grid.scenario)
+    return [[select_rows(own, variant=grid.points.get((a, b))) for b in grid.values[1]] for a in grid.values[0]]

@@ -18,13 +18,14 @@ import pandas as pd
 import typer
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.geometry import Int64Array
 from cdpipe.core.threads import THREADS
 from cdpipe.descriptors import checkpoint_digest, list_checkpoints, sphere_digest, use_threads
 from cdpipe.model.config import load_config
 from eval.core.domains import domain_of
 from eval.core.output import make_writable, remove
 from eval.core.provenance import digest, git_commit, machine
-from eval.core.statistics import bootstrap_interval, interval_over_tunnels, mean, median
+from eval.core.statistics import interval_over_tunnels, mean, median
 from eval.core.terminal.exits import run_program
 from eval.core.terminal.progress import RunProgress, shown_progress
 from eval.plans.seeds import parse_seeds_option
@@ -154,7 +155,7 @@ def tabulate_places(rows: pd.DataFrame) -> pd.DataFrame:
     for group, own in _groups(rows[rows["descriptor"] != SPHERE]):
         for (descriptor, precision), cases in own.groupby(["descriptor", "precision"], sort=False):
             yaws_deg = numbers(cases, "yaw_error_deg")
-            low, high = bootstrap_interval(yaws_deg, "median")
+            low, high = interval_over_tunnels(yaws_deg, _tunnels(cases), "median")
             table.append(
                 {
                     "group": group,
@@ -218,9 +219,13 @@ def _groups(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 
 def _mean(cases: pd.DataFrame, column: str) -> dict[str, float]:
     values = numbers(cases, column)
-    low, high = interval_over_tunnels(values, tunnels_of(cases.assign(scenario=cases["family"])))
+    low, high = interval_over_tunnels(values, _tunnels(cases))
     value = mean(values)
     return {column: value, f"{column}_low": low, f"{column}_high": high}
+
+
+def _tunnels(cases: pd.DataFrame) -> Int64Array:
+    return tunnels_of(cases.assign(scenario=cases["family"]))
 
 
 def _price(cases: pd.DataFrame) -> dict[str, Any]:

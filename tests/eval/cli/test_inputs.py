@@ -51,7 +51,9 @@ def test_what_detect_says_of_recordings_and_their_options(tmp_path: Path, comman
     refused(command("view", tmp_path / "ours", "--trajectory", poses, "--html", tmp_path / "v.html"), "its own poses")
     refused(command("view", "smoke/one_box", "--no-deskew", "--html", tmp_path / "v.html"), "a world has no recording")
     refused(command("describe", bag, "--format", "pdf"), "--format pdf: expected one of session")
-    refused(command("view", tmp_path / "ours", "--origin", "1,2,3", "--html", tmp_path / "v.html"), "leave --origin out")
+    refused(
+        command("view", tmp_path / "ours", "--origin", "1,2,3", "--html", tmp_path / "v.html"), "leave --origin out"
+    )
     refused(command("describe", tmp_path / "ours", "--format", "session"), "session.json: ")  # read as one, and damaged
     refused(command("graft", folder, "--topic", "/x", *out), "run is no bag: leave it out")
     refused(command("graft", bag, "--metadata", "m.json", *out), "--metadata is the sensor of a .pcap: leave it out")
@@ -60,13 +62,17 @@ def test_what_detect_says_of_recordings_and_their_options(tmp_path: Path, comman
 
 def test_a_grid_of_a_world_is_refused_by_its_own_name(tmp_path: Path, command: Command) -> None:
     out = ("--out", tmp_path / "out")
-    refused(command("run", "smoke", "--grid", "sensor.mode=512x10,1024x10", *out), "--grid sensor.mode=512x10,1024x10: a")
+    refused(
+        command("run", "smoke", "--grid", "sensor.mode=512x10,1024x10", *out), "--grid sensor.mode=512x10,1024x10: a"
+    )
     refused(command("run", "smoke", "--set", "sensor.mode=512x10", *out), "--set sensor.mode=512x10: a setting of the")
 
 
 def test_a_wrong_name_makes_no_folder(tmp_path: Path, command: Command) -> None:
     refused(command("survey", "nosuch", "--out", tmp_path / "new" / "x.csv"), "nosuch")
-    refused(command("bench", "--only", "nosuch", "--out", tmp_path / "new" / "x.json"), "'nosuch' is no row of the table")
+    refused(
+        command("bench", "--only", "nosuch", "--out", tmp_path / "new" / "x.json"), "'nosuch' is no row of the table"
+    )
     assert not any(tmp_path.iterdir())
 
 

@@ -17,7 +17,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.names import path_part
 from eval.leaderboard.calls import digest_method, read_evaluation
 from eval.leaderboard.packing import pack_submission
-from eval.leaderboard.page import write_leaderboard
+from eval.leaderboard.page import take_rows, write_leaderboard
 from eval.leaderboard.submission import CheckedFile, read_submission, score_again
 from eval.running.runfolder import RunFolder, write_json
 from eval.scoring import scoring
@@ -427,3 +427,9 @@ def test_a_reference_that_was_given_the_merge_is_told(packed: Path, evaluated: R
     other = renamed(read_submission(packed), "theirs")
     write_leaderboard([other], tmp_path / "b.html", evaluated.path, [0])
     assert (tmp_path / "b.html").read_text().count("told the true one") == 2
+
+
+def test_a_kind_of_pair_is_of_the_plan_and_not_of_the_row(packed: Path) -> None:
+    claimed = read_submission(rewrite(packed, in_row(pair_kind="disjoint")))
+    assert claimed.content.pairs[0].row["pair_kind"] == "disjoint"
+    assert set(take_rows(claimed)["pair_kind"]) == {""}

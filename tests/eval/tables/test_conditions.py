@@ -94,3 +94,18 @@ def test_merges_are_counted_for_each_kind_and_odometry(*, has_both: bool) -> Non
         ["kiss-icp", 2, 1, False], *([["drift", 1, 1, True]] if has_both else []),
     ]  # fmt: skip
     assert ("odometry" in merge_overview(pd.DataFrame(rows), targets)) == has_both
+
+
+def test_the_interval_of_a_sensor_draws_tunnels() -> None:
+    rows = [
+        {**row(KISS, "u0", seed, object_iou_point=value), "family": family, "scenario": family}
+        for seed, value in enumerate((0.5, 0.6, 0.7))
+        for family in ("narrow", "dust/narrow")
+    ]
+    asked = (Target(column="object_iou_point", name="u0", sensor="u0", at_least=0.5),)
+    changes = pd.DataFrame([change("narrow", 1, 1)])
+    found = object_tables(pd.DataFrame(rows), changes, ASKED.model_copy(update={"objects": asked}))
+    judged = found["objects_targets"].iloc[0]
+    # one draw of three tunnels in 27 holds the worst alone; of six pairs one in 729 would
+    assert (judged["value"], judged["n"]) == (pytest.approx(0.6), 6)
+    assert [judged["low"], judged["high"]] == pytest.approx([0.5, 0.7])

@@ -63,11 +63,12 @@ def the_row(table: pd.DataFrame, domain: str, variant: str = "tunnelcd") -> dict
 def test_a_row_by_hand() -> None:
     rows = [
         case("narrow", 1, object_iou_point=0.9, false_regions_per_100m_proposed=2.0, n_withdrawn=2, n_partial=1,
-             object_iou_point_partial=0.4, region_recall_proposed=1.0, region_recall=0.5),
-        case("narrow", 2, object_iou_point=0.6, after_path_m=300.0, false_regions_per_100m=1.0,
+             n_observable=2, object_iou_point_partial=0.4, region_recall_proposed=1.0, region_recall=0.5),
+        case("narrow", 2, n_observable=2, object_iou_point=0.6, after_path_m=300.0, false_regions_per_100m=1.0,
              false_regions_per_100m_proposed=1.0, t_oe_per_region_s=0.004),
-        case("narrow", 3, object_iou_point=0.0, status="merge_refused", region_recall=0.0, region_recall_proposed=0.0,
-             false_regions_per_100m=NAN, false_regions_per_100m_proposed=NAN, t_oe_per_region_s=NAN),
+        case("narrow", 3, n_observable=1, object_iou_point=0.0, status="merge_refused", region_recall=0.0,
+             region_recall_proposed=0.0, false_regions_per_100m=NAN, false_regions_per_100m_proposed=NAN,
+             t_oe_per_region_s=NAN),
     ]  # fmt: skip
     changes = [
         change("narrow", 1, 1, iou_point=0.9, displacement_error_m=0.02),
@@ -79,6 +80,7 @@ def test_a_row_by_hand() -> None:
     ]
     row = the_row(tables(rows, changes)["objects_table"], "in")
     assert (row["n_pairs"], row["n_refused"], row["n_failed"]) == (3, 1, 1)
+    assert row["n_observable"] == 5  # what tables of regions count
     # the partial and the unobservable one are not among the main ones
     assert (row["n_changes"], row["n_partial"], row["n_matched"], row["n_withdrawn"]) == (4, 1, 3, 2)
     assert row["object_iou_point"] == pytest.approx(0.5)

@@ -21,6 +21,7 @@ from eval.report.comparing.differences import (
     paired_differences,
     verdict,
 )
+from eval.report.comparing.page import compare_sides
 from eval.report.page import write_page
 from eval.report.summary import means_by_method
 from eval.running.results.run_data import read_run
@@ -391,3 +392,39 @@ def test_times_of_other_machines_are_shown_and_not_judged(write: Write) -> None:
     assert the_row(compared(a, b), "t_total_s")["verdict"] == WORSE
     found = the_row(compared(a, b, times_count=False), "t_total_s")
     assert (found["verdict"], found["difference"]) == (NOT_JUDGED, 1.0)
+
+
+def test_domains_are_compared_over_the_pairs_of_the_plan_alone(write: Write) -> None:
+    def rows(kiss: float, drift: float) -> list[dict[str, object]]:
+        of = {"kiss-icp": kiss, "drift": drift}
+        return [
+            {**row(seed, f"narrow[odometry={name}]", region_recall=recall), "family": "narrow",
+             "odometry_before": name, "odometry_after": name}
+            for name, recall in of.items() for seed in range(8)
+        ]  # fmt: skip
+
+    a, b = write("a", rows(0.5, 0.5)), write("b", rows(0.25, 1.0))
+    plan = {"name": "mine", "targets": {"method": "tunnelcd", "odometry": "kiss-icp"}}
+    for folder in (a, b):
+        (folder / "provenance.json").write_text(json.dumps({"tool": "tunnelcd", "plan": plan}))
+    table = compared(a, b)
+    assert the_row(table, "region_recall")[["n_pairs", "difference", "verdict"]].tolist() == [8, -0.25, WORSE]
+    of_drift = the_row(table, "region_recall", "narrow[odometry=drift]")
+    assert of_drift[["n_pairs", "difference"]].tolist() == [8, 0.5]
+    told = compare_sides(read_side(str(a)), read_side(str(b))).cautions[0]
+    assert told.startswith("Domains are compared over pairs with kiss-icp alone")
+
+
+def test_a_cost_that_some_answers_leave_out_is_not_compared(write: Write) -> None:
+    a = write("a", [row(seed, t_total_s=4.0, bytes_regions_before=100) for seed in range(8)])
+    b = write("b", [row(seed, t_total_s=1.0 if seed < 6 else NAN, bytes_regions_before=10) for seed in range(8)])
+    table = compared(a, b)
+    assert "t_total_s" not in set(table["metric"])
+    assert the_row(table, "bytes_regions_before")["verdict"] == BETTER
+
+
+def test_objects_without_regions_are_an_alarm_where_nothing_changed() -> None:
+    rows = [row(1, is_unchanged_pair=True, is_alarm=False, n_objects=n) for n in (0, 500)]
+    rows.append(row(2, is_unchanged_pair=False, is_alarm=NAN, n_objects=3))
+    found = figures_of(pd.DataFrame(rows))["is_alarm"]
+    assert found.tolist()[:2] == [0.0, 1.0] and np.isnan(found[2])

@@ -273,6 +273,18 @@ def test_a_grid_holds_means_and_frames_the_best_as_written() -> None:
     assert "n = 2 session pairs" in chart.caption
 
 
+def test_a_mean_over_fewer_pairs_than_another_has_no_frame() -> None:
+    rows = [
+        {"scenario": "narrow", "seed": seed, "variant": f"p[a.x={a},b.y={b}]", "object_iou_point": 0.1 * a + 0.01 * b}
+        for a in (1, 2) for b in (1, 2) for seed in (0, 1) if (a, b, seed) != (2, 2, 1)
+    ]  # fmt: skip
+    (chart,) = draw_grids(run(rows))
+    ((iou,),) = read_panels(chart.drawing)
+    assert [text for text, _ in iou.cells] == ["0.11", "0.12", "0.21", "0.22"]
+    (frame,) = iou.series
+    np.testing.assert_allclose(frame.points[:4].mean(axis=0), [0.0, 1.0], atol=5e-3)
+
+
 def test_a_difference_below_the_last_digit_has_no_colour_and_no_frame() -> None:
     def of(iou: float, seconds: float) -> list[dict[str, object]]:
         return [
@@ -313,3 +325,17 @@ def test_a_point_beyond_its_interval_is_drawn() -> None:
     np.testing.assert_allclose(series.intervals, [[0.0, NAN], [0.3, NAN]])
     (drawn,) = picture(one_panel(series)).axes[0].collections
     np.testing.assert_allclose(drawn.get_segments()[0][:, 1], [0.5, 0.8])
+
+
+def test_a_curve_ends_at_the_right_border_with_the_recall_that_it_has_there() -> None:
+    rows = [
+        ("in", "paper", 0.5, 0.25),
+        ("in", "paper", 10.0, 0.5),
+        ("in", "paper", 13.0, 0.75),
+        ("in", "paper", 80.0, 1.0),
+    ]
+    table = pd.DataFrame(rows, columns=["domain", "variant", "false_regions_per_100m", "recall"])
+    chart = draw_free_response(table, TABLE)
+    assert chart is not None
+    (curve,) = (series for series in drawn_series(chart.drawing) if series.name == "paper")
+    assert curve.points[:, 1].max() == pytest.approx(0.5, abs=5e-3)

@@ -10,6 +10,7 @@ import pytest
 from eval.plans.targets import read_targets
 from eval.report.comparing.differences import BETTER, NOISE, SAME, TOO_FEW, WORSE
 from eval.report.framing.headline import name_by_setting, name_leaders, name_without_shared, write_answer, write_title
+from eval.report.summary import rank_methods
 from eval.running.results.run_data import RunData
 from eval.running.runfolder import RunFolder
 from eval.tables.columns import Column, share
@@ -264,3 +265,15 @@ def test_axes_that_are_not_measured_yet_give_no_leader(tmp_path: Path) -> None:
 def test_a_run_of_one_method_names_no_leader(tmp_path: Path) -> None:
     rows = [{"scenario": "narrow", "variant": "mine", "region_recall": 0.5}]
     assert write_answer(run(tmp_path, rows), pd.DataFrame()) == "The run holds too little to compare two methods."
+
+
+def test_where_nothing_changed_the_table_begins_with_the_fewest_alarms(tmp_path: Path) -> None:
+    alarms = {f"m{number}": number for number in range(9, -1, -1)}  # the silent one is run last
+    rows = [
+        {"scenario": "narrow", "seed": seed, "variant": name, "is_unchanged_pair": True, "n_observable": 0,
+         "is_alarm": seed < n, "false_regions_per_100m": float(n)}
+        for name, n in alarms.items() for seed in range(10)
+    ]  # fmt: skip
+    ranked, shown, _ = rank_methods(run(tmp_path, rows))
+    assert ranked["variant"].tolist() == sorted(alarms)
+    assert [column.key for column in shown] == ["false_regions_per_100m", "is_alarm"]

@@ -90,6 +90,17 @@ def test_table_by_hand(run: Path) -> None:
     assert "its sensor" in first.table.caption
 
 
+def test_a_mean_over_fewer_pairs_than_its_row_says_so(run: Path) -> None:
+    results = pd.read_csv(run / "results.csv")
+    is_refused = results["scenario"].eq(NOISE) & results["seed"].gt(0)
+    results.loc[is_refused, "merge_error_m"] = NAN
+    results.to_csv(run / "results.csv", index=False)
+    first, _ = draw_effects(read_run(run))
+    (noise,) = (cells for group, cells in first.table.rows if (group, cells[0].text) == ("ours", "range_noise=false"))
+    assert (noise[1].text, noise[-1].interval) == ("6", "1 of 6 pairs")
+    assert noise[3].interval == "+0.25 to +0.25"
+
+
 def test_five_pairs_that_agree_are_not_set_in_bold(run: Path) -> None:
     results = pd.read_csv(run / "results.csv")
     results[results["seed"] < 5].to_csv(run / "results.csv", index=False)
