@@ -10,18 +10,19 @@ from __future__ import annotations
 import json
 import tempfile
 import warnings
-from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import require_plain_file
 from cdpipe.core.isolated_reader import Message
+from cdpipe.core.names import visible
+from cdpipe.io.foreign.bag_layout import find_paths, read_packed, require_one_recording
 from cdpipe.io.foreign.clouds import INTENSITY_FIELDS, TIME_FIELDS, field_of
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -32,10 +33,13 @@ _OLD_TRANSFORMS = "tf/msg/tfMessage"
 # Numbers of sensor_msgs/PointField.
 _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _MOST_POINTS = 10_000_000
-_MOST_POSES = 2_000_000
+_MOST_POSES, _MOST_TRANSFORMS = 2_000_000, 20_000_000  # of one frame, and of all: 64 bytes each
+_OTHER_POSES = ": give --trajectory FILE, or --odometry kiss-icp"
 _MOST_TOPICS = 10_000
 _MOST_FRAMES = 8
 _STAMPS_AT_ONCE = 50  # 5 s of a recording
+_BLOCK_BYTES = 8 << 20
+_LIBRARIES = ("rosbags", "sqlite3", "zstandard", "lz4", "ruamel", "struct")
 _ERRORS = (
     OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, AttributeError, AssertionError,
     UnicodeError, EOFError,
@@ -82,24 +86,72 @@ def read_clouds(path: str, topic: str) -> Iterator[Message]:
             yield {}, _cloud(message)
 
 
-def read_transforms(path: str, topics: Sequence[str]) -> Iterator[Message]:
+def read_transforms(path: str, topics: Sequence[str], frame: str | None = None) -> Iterator[Message]:
     """Yield, for each pair of frames of Odometry, PoseStamped or tf topics, the stamps (N,) and poses (N, 7).
 
-    A pose is x, y, z, qx, qy, qz, qw of `child` in `parent`; a PoseStamped has no child.
+    A pose is x, y, z, qx, qy, qz, qw of `child` in `parent`; a PoseStamped has no child. With `frame`, only pairs above
+    it and above what Odometry is of: a robot may have a hundred joints elsewhere.
     """
-    found: dict[tuple[str, str, bool], list[tuple[int, list[float]]]] = {}
+    found: dict[tuple[str, str, bool], tuple[array[int], array[float]]] = {}
     n_poses = 0
     with _bag(path) as bag:
         for message, topic in _messages(bag, topics):
             for parent, child, stamp, pose in _transforms(message):
                 n_poses += 1
-                if n_poses > _MOST_POSES:
-                    raise ValueError(f"more than {_MOST_POSES} poses")
-                found.setdefault((parent, child, topic.endswith("_static")), []).append((stamp, pose))
-    for (parent, child, is_static), rows in found.items():
+                if n_poses > _MOST_TRANSFORMS:
+                    raise InputError(f"{path}: more than {_MOST_TRANSFORMS} transforms{_OTHER_POSES}")
+                key = parent, child, topic.endswith("_static")
+                stamps, poses = found.setdefault(key, (array("q"), array("d")))
+                stamps.append(stamp)
+                poses.extend(pose)
+        kept = None if frame is None else _find_above({*_tracked(bag), frame}, found)
+    for (parent, child, is_static), (stamps, poses) in found.items():
+        if kept is not None and child not in kept:
+            continue
+        if len(stamps) > _MOST_POSES:
+            raise InputError(
+                f"{path}: more than {_MOST_POSES} poses of {visible(child)} in {visible(parent)}{_OTHER_POSES}"
+            )
         about = {"parent": parent, "child": child, "is_static": is_static}
-        stamps, poses = zip(*rows, strict=True)
-        yield about, {"stamps": np.array(stamps, np.int64), "poses": np.array(poses, np.float64)}
+        yield about, {"stamps": np.array(stamps, np.int64), "poses": np.array(poses, np.float64).reshape(-1, 7)}
+
+
+def _find_above(frames: set[str], pairs: Iterable[tuple[str, str, bool]]) -> set[str]:
+    """Return frames and all frames above them."""
+    while more := {parent for parent, child, _ in pairs if child in frames} - frames:
+        frames = frames | more
+    return frames
+
+
+def _tracked(bag: Any) -> set[str]:
+    """Return the frames of which the Odometry of a bag is, by its first messages; of unreadable ones none."""
+    frames: set[str] = set()
+    for topic in {each.topic for each in bag.connections if each.msgtype == ODOMETRY}:
+        with suppress(Exception):
+            frames.update(
+                child for message, _ in islice(_messages(bag, [topic]), 10) for _, child, *_ in _transforms(message)
+            )
+    return frames
+
+
+def unpack(path: str) -> Iterator[Message]:
+    """Yield the metadata of a file-compressed ROS 2 bag, as JSON, then its files, decompressed, block by block.
+
+    Of another bag nothing is yielded.
+    """
+    import zstandard
+
+    with _tells(path):
+        about, names = read_packed(Path(path))
+        if names:
+            yield {"metadata": json.dumps(about)}, {}
+        for name in names:
+            with (
+                (Path(path) / name).open("rb") as file,
+                zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True) as plain,
+            ):
+                while block := plain.read(_BLOCK_BYTES):
+                    yield {"file": Path(name).stem}, {"block": np.frombuffer(block, np.uint8)}
 
 
 def _transforms(message: Any) -> Iterator[tuple[str, str, int, list[float]]]:
@@ -121,9 +173,12 @@ def _cloud(message: Any) -> dict[str, Any]:
     height, width, step = int(message.height), int(message.width), int(message.point_step)
     data = np.asarray(message.data, np.uint8)
     n_points = height * width
+    if n_points == 0:  # whose fields and steps some drivers leave at 0
+        return {"points": np.zeros((0, 3))}
     if not 0 <= n_points <= _MOST_POINTS or step <= 0:
         raise ValueError(f"a cloud of {height} x {width} points of {step} bytes")
-    row = int(message.row_step) or width * step
+    has_padding = height > 1 and len(data) != n_points * step  # else nothing asks for the row's step
+    row = (int(message.row_step) if has_padding else 0) or width * step
     if row < width * step or len(data) < (height - 1) * row + width * step:
         raise ValueError(f"a cloud announces {n_points} points of {step} bytes and holds {len(data)} bytes")
     if row != width * step:  # rows with padding
@@ -173,13 +228,20 @@ def _bag(path: str) -> Iterator[Any]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise InputError(f"{path}: a bag needs a package more: pip install 'tunnelcd[formats]'") from error
+    with _tells(path), tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = find_paths(Path(path), Path(folder))
+        with AnyReader(found, default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+            require_one_recording(bag.readers)
+            _keep_chunks_at_0(bag)
+            yield bag
+
+
+@contextmanager
+def _tells(path: str) -> Iterator[None]:
+    """Let what a damaged bag provokes become one `InputError`."""
     try:
-        with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            whole = _as_bag(Path(path), Path(folder))
-            with AnyReader([whole], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
-                _keep_chunks_at_0(bag)
-                yield bag
+        yield
     except InputError:
         raise
     except Exception as error:
@@ -196,89 +258,3 @@ def _keep_chunks_at_0(bag: Any) -> None:
             for place, chunk in enumerate(getattr(file, "chunks", ())):
                 if chunk.message_start_time == 0 and chunk.channel_count:
                     file.chunks[place] = chunk._replace(message_start_time=-1)
-
-
-_MCAP, _SQLITE = b"\x89MCAP", b"SQLite format 3"
-_LIBRARIES = ("rosbags", "sqlite3", "zstandard", "lz4", "ruamel", "struct")
-
-
-def _as_bag(path: Path, folder: Path) -> Path:
-    """Return what rosbags opens: the file of a ROS 1 bag, or a folder with metadata.yaml, made for a lone file."""
-    if path.is_dir():
-        for each in path.iterdir():
-            if not each.is_dir():
-                require_plain_file(each)
-        if (path / "metadata.yaml").is_file():
-            return path
-        files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3", ".bag"))
-        if len(files) != 1:
-            raise ValueError(f"{len(files)} files without a metadata.yaml: name one of them")
-        path = files[0]
-    require_plain_file(path)
-    with path.open("rb") as file:
-        head = file.read(16)
-    if head.startswith(b"#ROSBAG"):
-        return path
-    if not head.startswith((_MCAP, _SQLITE)):
-        raise ValueError(
-            f"it begins with none of {b'#ROSBAG'!r}, {_MCAP!r} and {_SQLITE!r}: cut short or no bag: copy or record it "
-            "again"
-        )
-    (folder / path.name).symlink_to(path.absolute())
-    is_mcap = head.startswith(_MCAP)
-    topics = _topics_of_mcap(path) if is_mcap else _topics_of_sqlite(path)
-    about = {
-        "version": 5,
-        "storage_identifier": "mcap" if is_mcap else "sqlite3",
-        "relative_file_paths": [path.name],
-        "duration": {"nanoseconds": 0},
-        "starting_time": {"nanoseconds_since_epoch": 0},
-        "message_count": sum(count for *_, count in topics),
-        "compression_format": "",
-        "compression_mode": "",
-        "topics_with_message_count": [
-            {"topic_metadata": {"name": name, "type": kind, "serialization_format": form, "offered_qos_profiles": ""},
-             "message_count": count}
-            for name, kind, form, count in topics
-        ],
-    }  # fmt: skip
-    (folder / "metadata.yaml").write_text(json.dumps({"rosbag2_bagfile_information": about}), encoding="utf-8")
-    return folder
-
-
-class _Channel(NamedTuple):
-    """What rosbags asks of a connection, and the number of the channel."""
-
-    topic: str
-    msgtype: str
-    key: int
-
-
-def _topics_of_mcap(path: Path) -> list[tuple[str, str, str, int]]:
-    from rosbags.rosbag2.storage_mcap import MCAPFile
-
-    file = MCAPFile(path)
-    file.open()
-    try:
-        if not file.channels:
-            file.meta_scan()
-        counts: Counter[int] = Counter()
-        for chunk in file.chunks:
-            counts.update(chunk.channel_count)
-        if not file.chunks:  # nor an index: every message is looked at
-            asked = [_Channel(each.topic, each.schema, key) for key, each in file.channels.items()]
-            counts.update(each.key for each, *_ in file.messages_scan(asked))
-        return [(it.topic, it.schema, it.message_encoding, counts.get(it.id, 0)) for it in file.channels.values()]
-    finally:
-        file.close()
-
-
-def _topics_of_sqlite(path: Path) -> list[tuple[str, str, str, int]]:
-    import sqlite3
-    from contextlib import closing
-    from urllib.parse import quote
-
-    with closing(sqlite3.connect(f"file:{quote(str(path.absolute()))}?immutable=1", uri=True)) as base:
-        counts = dict(base.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id").fetchall())
-        rows = base.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
-    return [(str(name), str(kind), str(form), int(counts.get(key, 0))) for key, name, kind, form in rows]

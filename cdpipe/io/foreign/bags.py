@@ -2,51 +2,42 @@
 
 from __future__ import annotations
 
+import shutil
 import warnings
+import weakref
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError, InputWarning
-from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert, make_pose
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array
 from cdpipe.core.isolated_reader import IsolatedReader
 from cdpipe.core.names import visible
 from cdpipe.core.plugins import require_extra
 from cdpipe.core.progress import Progress
 from cdpipe.io.foreign.bag_files import CLOUD, ODOMETRY, POSE, TRANSFORMS
 from cdpipe.io.foreign.clouds import Cloud, check_cloud
-from cdpipe.io.foreign.trajectory import Trajectory
-from cdpipe.io.tum import are_poses, require_unit_poses
+from cdpipe.io.foreign.frames import (
+    FIXED,
+    NO_SENSOR,
+    Edge,
+    compose,
+    find_chain,
+    find_mounting,
+    is_base,
+    is_fixed,
+    make_edge,
+)
+from cdpipe.io.foreign.packed_bags import unpack_bag
+from cdpipe.io.foreign.trajectory import Trajectory, find_gaps
+from cdpipe.io.tum import are_poses
 
-# Frames in which a robot keeps its way, the smooth one first; that of LOAM and its kin moves with no sensor either.
-_FIXED = ("odom", "map", "world")
-_NO_SENSOR = (*_FIXED, "camera_init")
-_STANDING = 1e-6  # change of a pose entry, metres or radians, that is none
-_LONGEST_CHAIN = 64
 _LISTED = 8
+_MOST_WRONG = 0.05  # share of Odometry or PoseStamped messages that may hold no pose, as the first of a filter do
 _MOST_WAITING = 64  # clouds in memory while they are sorted: 200 MB of 130,000 points each
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Edge:
-    """Poses (N, 4, 4) of a frame in its parent at (N,) rising times, seconds; a fixed one has one pose."""
-
-    parent: str
-    time_s: Float64Array
-    poses: Float64Array
-
-    def at(self, time_s: Float64Array) -> Float64Array:
-        if not self.is_moving:
-            return self.poses[:1].repeat(len(time_s), axis=0)
-        motion = Trajectory("", self.poses, self.time_s).motion()
-        return self.poses[:1].repeat(len(time_s), axis=0) if motion is None else motion.poses(time_s)
-
-    @property
-    def is_moving(self) -> bool:
-        return bool(np.ptp(self.poses, axis=0).max() > _STANDING)  # a publisher of static frames may repeat them
 
 
 class BagScans:
@@ -70,7 +61,11 @@ class BagScans:
         self.name = str(path)
         self.own: Trajectory | None = None
         self._path, self._reader = path, IsolatedReader("cdpipe.io.foreign.bag_files", path, "rosbags")
-        ((about, _),) = self._reader.read("list_topics", path=self.name)
+        unpacked = unpack_bag(path, self._reader)
+        if unpacked is not None:
+            weakref.finalize(self, shutil.rmtree, unpacked.parent, ignore_errors=True)
+        self._source = str(unpacked or path)
+        ((about, _),) = self._reader.read("list_topics", path=self._source)
         self._topics = [(name, kind, count) for name, kind, count in about["topics"] if count]
         unknown = sorted(set(topics) - {name for name, *_ in self._topics})
         if unknown:
@@ -83,7 +78,7 @@ class BagScans:
         stamps = stamps[self._numbers]
         self.stamps_s: Float64Array | None = stamps / 1e9
         self.lacks = f"no poses of the sensor in it (it holds {self._listed()})"
-        if is_posed and self._frame in _NO_SENSOR:
+        if is_posed and self._frame in NO_SENSOR:
             told = f"its frame is {self._frame}, which does not move with the sensor: where the clouds are registered"
             warnings.warn(f"{path}: {self._topic}: {told} already, name the raw ones", InputWarning, stacklevel=2)
         if not is_posed:
@@ -105,7 +100,7 @@ class BagScans:
 
     def read_all(self) -> Iterator[Cloud]:
         """Read all scans in order; points that are not finite are missing returns."""
-        messages = self._reader.read("read_clouds", path=self.name, topic=self._topic)
+        messages = self._reader.read("read_clouds", path=self._source, topic=self._topic)
         places = {number: place for place, number in enumerate(self._numbers.tolist())}
         waiting: dict[int, Cloud] = {}
         done = 0
@@ -126,7 +121,7 @@ class BagScans:
         frames: set[str] = set()
         n_done = 0
         report("look through", n_done, n_announced)
-        for about, arrays in self._reader.read("read_stamps", path=self.name, topic=self._topic):
+        for about, arrays in self._reader.read("read_stamps", path=self._source, topic=self._topic):
             frames.update(str(frame) for frame in about["frames"])
             stamps.append(arrays["stamps"])
             has_returns.append(arrays["has_returns"] > 0)
@@ -206,37 +201,56 @@ class BagScans:
         assert own.time_s is not None
         slack_s = max(float(np.median(np.diff(times))) if len(times) > 1 else 0.0 for times in (stamps_s, own.time_s))
         is_inside = (stamps_s >= own.time_s[0] - slack_s) & (stamps_s <= own.time_s[-1] + slack_s)
-        n_out = int(np.count_nonzero(~is_inside))
-        if n_out == len(stamps_s):
+        if not is_inside.any():
             raise InputError(
                 f"{self._path}: its poses ({own.time_s[0]:.3f} to {own.time_s[-1]:.3f} s) and its clouds "
                 f"({stamps_s[0]:.3f} to {stamps_s[-1]:.3f} s) are of different times: give --trajectory FILE"
             )
+        gaps_s, longest_s = find_gaps(own, stamps_s)
+        is_known = is_inside & (gaps_s <= longest_s)
+        n_out = int(np.count_nonzero(~is_known))
+        places = "before or after its poses"
+        if (gaps_s[is_inside] > longest_s).any():
+            places += f", or where these pause for more than {longest_s:.2g} s"
+        if n_out == len(stamps_s):
+            raise InputError(f"{self._path}: all of its {n_out} clouds lie {places}: give --trajectory FILE")
         if n_out:
-            told = f"{n_out} of {len(stamps_s)} clouds lie before or after its poses, and are left out"
+            told = f"{n_out} of {len(stamps_s)} clouds lie {places}, and are left out"
             warnings.warn(f"{self._path}: {told}", InputWarning, stacklevel=2)
-        self._numbers = self._numbers[is_inside]
-        self.stamps_s = stamps_s[is_inside]
+        self._numbers = self._numbers[is_known]
+        self.stamps_s = stamps_s[is_known]
 
     def _find_poses(self, topics: Sequence[str]) -> Trajectory | None:
         """Return poses by a named topic; else by tf that moves below a fixed frame, Odometry, PoseStamped, other tf."""
         edges = self._read_edges([name for name, kind, _ in self._topics if kind == TRANSFORMS], is_tf=True)
         named = [(name, kind) for name, kind, _ in self._topics if name in topics and kind in (ODOMETRY, POSE)]
-        chain = _chain(edges, self._frame)
+        chain = find_chain(edges, self._frame)
         is_moving = any(edge.is_moving for edge in chain)
-        if not named and is_moving and chain[0].parent in _FIXED:
-            return _compose(f"tf of {self._path}", chain)
+        if not named and is_moving and chain[0].parent in FIXED:
+            return compose(f"tf of {self._path}", chain)
         for kind in (ODOMETRY, POSE):
             found = [name for name, its_kind in named if its_kind == kind]
             if found or (not named and any(its_kind == kind for _, its_kind, _ in self._topics)):
                 return self._read_poses(self._choose(kind, topics, kind.rsplit("/", 1)[-1]), edges)
-        is_standing = not is_moving and any(len(edge.time_s) > 1 for edge in chain) and chain[0].parent in _FIXED
+        is_standing = not is_moving and any(len(edge.time_s) > 1 for edge in chain) and chain[0].parent in FIXED
         if is_standing:
             told = f"by its tf {visible(self._frame)} stands in {visible(chain[0].parent)}, and so does the sensor"
             warnings.warn(f"{self._path}: {told}", InputWarning, stacklevel=2)
-        return _compose(f"tf of {self._path}", chain) if is_moving or is_standing else None
+        if is_moving and not is_fixed(chain[0].parent) and self._is_part(chain[0].parent):
+            return None
+        return compose(f"tf of {self._path}", chain) if is_moving or is_standing else None
 
-    def _read_poses(self, topic: str, edges: dict[str, _Edge]) -> Trajectory | None:
+    def _is_part(self, root: str) -> bool:
+        """Tell whether the frame above all others is a part of the robot by its name; warn where it may be one."""
+        told = f"tf moves {visible(self._frame)} in {visible(root)} alone"
+        if is_base(root):
+            self.lacks += f", and {told}, a part of the robot"
+            return True
+        told += ", which is taken for a fixed frame: where it is a part of the robot, give --odometry kiss-icp"
+        warnings.warn(f"{self._path}: {told}", InputWarning, stacklevel=2)
+        return False
+
+    def _read_poses(self, topic: str, edges: dict[str, Edge]) -> Trajectory | None:
         """Return the poses of one topic, with the fixed mounting of the sensor on what they are poses of.
 
         Clouds in the frame that the poses lie in are registered already, as those of LOAM and its kin are.
@@ -247,17 +261,17 @@ class BagScans:
                 told = f"its clouds are in {visible(self._frame)}, the frame of the poses of {topic}"
                 told += ": they are taken as registered, and moved back"
                 warnings.warn(f"{self._path}: {self._topic}: {told}", InputWarning, stacklevel=2)
-                found = _compose(where, [edge])
+                found = compose(where, [edge])
                 return found and replace(found, holds_clouds=True)
             if child == self._frame:
-                return _compose(where, [edge])
-            mounting = _mounting(edges, child, self._frame) if child else []
+                return compose(where, [edge])
+            mounting = find_mounting(edges, child, self._frame) if child else []
             if not mounting:
                 self._warn_of_base(topic, child, edges)
-            return _compose(where, [edge, *mounting])
+            return compose(where, [edge, *mounting])
         return None
 
-    def _warn_of_base(self, topic: str, child: str, edges: dict[str, _Edge]) -> None:
+    def _warn_of_base(self, topic: str, child: str, edges: dict[str, Edge]) -> None:
         """Warn that poses may be those of a base, and are taken for the sensor's."""
         sensor = visible(self._frame)
         if child:
@@ -269,87 +283,31 @@ class BagScans:
         told += ": they are taken for those of the sensor: where they are not, give --trajectory FILE"
         warnings.warn(f"{self._path}: {told}", InputWarning, stacklevel=2)
 
-    def _read_edges(self, topics: Sequence[str], *, is_tf: bool = False) -> dict[str, _Edge]:
+    def _read_edges(self, topics: Sequence[str], *, is_tf: bool = False) -> dict[str, Edge]:
         """Return the edge above each frame, by the frame; a frame with two parents keeps the one that moves.
 
-        Of tf, transforms that are none are left out, as they may be of any part of a robot.
+        Transforms of tf that are no poses are left out, as they may be of any part of a robot. So are messages of
+        poses, if they are few.
         """
-        edges: dict[str, _Edge] = {}
-        if not topics:
-            return edges
-        for about, arrays in self._reader.read("read_transforms", path=self.name, topics=list(topics)):
+        edges: dict[str, Edge] = {}
+        only = {"frame": self._frame} if is_tf else {}
+        asked: dict[str, Any] = {"path": self._source, "topics": list(topics), **only}
+        found = list(self._reader.read("read_transforms", **asked)) if topics else []
+        wrong = [~are_poses(arrays["poses"]) for _, arrays in found]
+        n_wrong = sum(int(np.count_nonzero(each)) for each in wrong)
+        leaves_out = is_tf or n_wrong <= _MOST_WRONG * sum(len(each) for each in wrong)
+        for (about, arrays), is_wrong in zip(found, wrong, strict=True):
             parent, child = str(about["parent"]), str(about["child"])
             where = f"{self._path}: {visible(child)} in {visible(parent)}"
             stamps, rows = arrays["stamps"], arrays["poses"]
-            if is_tf and not (is_pose := are_poses(rows)).all():
-                told = f"{np.count_nonzero(~is_pose)} of {len(rows)} transforms are no poses, and are left out"
+            if leaves_out and is_wrong.any():
+                what = "transforms are" if is_tf else "messages hold"
+                told = f"{np.count_nonzero(is_wrong)} of {len(rows)} {what} no poses, and are left out"
                 warnings.warn(f"{where}: {told}", InputWarning, stacklevel=2)
-                stamps, rows = stamps[is_pose], rows[is_pose]
+                stamps, rows = stamps[~is_wrong], rows[~is_wrong]
                 if not len(rows):
                     continue
-            edge = _make_edge(where, parent, stamps, rows, is_static=bool(about["is_static"]))
+            edge = make_edge(where, parent, stamps, rows, is_static=bool(about["is_static"]))
             if child not in edges or len(edge.time_s) > len(edges[child].time_s):
                 edges[child] = edge
         return edges
-
-
-def _make_edge(where: str, parent: str, stamps: Int64Array, rows: Float64Array, *, is_static: bool) -> _Edge:
-    if rows.ndim != 2 or rows.shape[1] != 7 or stamps.shape != (len(rows),) or not len(rows):
-        raise InputError(f"{where}: holds no poses")
-    require_unit_poses(rows, lambda index: f"{where}: pose {index}")
-    stamps, first = np.unique(stamps, return_index=True)
-    if is_static:
-        stamps, first = stamps[-1:], first[-1:]
-    rows = rows[first]
-    return _Edge(parent, stamps / 1e9, make_pose(Rotation.from_quat(rows[:, 3:]).as_matrix(), rows[:, :3]))
-
-
-def _chain(edges: dict[str, _Edge], frame: str, top: str = "") -> list[_Edge]:
-    """Return the edges from a fixed frame, or from `top`, down to a frame; empty if `top` is not above it."""
-    chain: list[_Edge] = []
-    above = [frame]
-    while above[-1] in edges and above[-1] != top and len(chain) < _LONGEST_CHAIN:
-        chain.append(edges[above[-1]])
-        above.append(chain[-1].parent)
-    if top:
-        return chain[::-1] if above[-1] == top else []
-    ends = next((above.index(name) for name in _FIXED if name in above), len(chain))
-    return chain[:ends][::-1]
-
-
-def _mounting(edges: dict[str, _Edge], base: str, frame: str) -> list[_Edge]:
-    """Return the edges that lead from a base to a frame of the same robot; empty where tf tells of no such way."""
-    way = _chain(edges, frame, base)
-    up: list[_Edge] = []
-    for edge in _climb(edges, base) if not way else ():
-        if edge.parent in _NO_SENSOR:
-            return []
-        up.append(replace(edge, poses=invert(edge.poses)))
-        way = _chain(edges, frame, edge.parent)
-        if way or edge.parent == frame:
-            return up + way
-    return way
-
-
-def _climb(edges: dict[str, _Edge], frame: str) -> list[_Edge]:
-    """Return the edges above a frame, the nearest first."""
-    found: list[_Edge] = []
-    while frame in edges and len(found) < _LONGEST_CHAIN:
-        found.append(edges[frame])
-        frame = found[-1].parent
-    return found
-
-
-def _compose(where: str, chain: Sequence[_Edge]) -> Trajectory | None:
-    """Return the poses along a chain of edges, at the times of that with the most; None if they share no time."""
-    moving = [edge.time_s for edge in chain if edge.is_moving]
-    moving = moving or [edge.time_s for edge in chain if len(edge.time_s) > 1] or [chain[0].time_s]
-    start_s, end_s = max(times[0] for times in moving), min(times[-1] for times in moving)
-    time_s = max(moving, key=len)
-    time_s = time_s[(time_s >= start_s) & (time_s <= end_s)]
-    if not len(time_s):
-        return None
-    poses = chain[0].at(time_s)
-    for edge in chain[1:]:
-        poses = poses @ edge.at(time_s)
-    return Trajectory(where, poses, time_s)

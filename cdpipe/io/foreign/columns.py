@@ -24,7 +24,7 @@ _NO_POSE = {
 }  # fmt: skip
 # Words of columns that hold where a sensor is, and of those that hold three numbers of something else.
 _PLACES = {"position", "pos", "translation", "trans", "pose", "p", "t"}
-_NO_PLACE = {"euler", "rpy", "imu", "mag", "magnetic", "field", "gravity"}
+_NO_PLACE = {"euler", "rpy", "imu", "mag", "magnetic", "gravity"}
 _OF_SOMETHING = 2
 _CLOCKS = ("time", "sec", "nsec")
 

@@ -81,7 +81,9 @@ class HowToRead:
             "no-deskew": not self.deskew, "origin": any(self.origin_m),
         }  # fmt: skip
         for name in (name for name, value in values.items() if value):
-            again = ": it is subtracted where a recording becomes a session: convert that again" if name == "origin" else ""
+            again = (
+                ": it is subtracted where a recording becomes a session: convert that again" if name == "origin" else ""
+            )
             raise InputError(f"{path}: {why}: leave --{name} out{again}")
 
     def subtracted_m(self, path: Path) -> tuple[float, float, float]:

@@ -24,6 +24,7 @@ _LIBRARY_MODULES = ("laspy", "lazrs", "pye57", "pyo3_runtime")
 # Points of one scan, or of one whole map: 24 bytes each.
 MOST_POINTS = 20_000_000
 _BLOCK = 1_000_000
+_HEADER_LINES = 10  # of a PCD file
 _KITTI = np.dtype("<f4")
 _MOST_NEGATIVE = 0.02  # share of intensities below 0 in scans of a layout that is read
 # What the libraries raise for a faulty file.
@@ -46,7 +47,9 @@ def cloud_reader(name: str, folder: Path) -> Callable[[Path], Cloud]:
     def read(path: Path) -> Cloud:
         parts = [arrays for _, arrays in reader.read(f"read_{name}", path=str(path)) if arrays]
         joined = {key: np.concatenate([part[key] for part in parts]) for key in (parts[0] if parts else ())}
-        return check_cloud(str(path), joined)
+        cloud = check_cloud(str(path), joined)
+        cloud.points[~np.isfinite(cloud.points).all(axis=1)] = np.nan  # missing returns, some say by one coordinate
+        return cloud
 
     return read
 
@@ -113,6 +116,7 @@ def read_pcd(path: str) -> Iterator[Message]:
     from pypcd4.pypcd4 import PointCloud
 
     with _reads(path, "a PCD file"):
+        _require_whole_names(path)
         cloud = PointCloud.from_path(path)
         data, names = cloud.pc_data, list(cloud.fields)
         if len(data) != cloud.metadata.points:
@@ -127,12 +131,34 @@ def read_pcd(path: str) -> Iterator[Message]:
     yield {}, arrays | {key: np.ascontiguousarray(data[name]) for key, name in more.items() if name is not None}
 
 
+def _require_whole_names(path: str) -> None:
+    """Raise `InputError` if pypcd4 ends the names of fields early: it takes the rows for shorter than they are."""
+    from pypcd4.pypcd4 import MetaData
+
+    lines: list[str] = []
+    with Path(path).open("rb") as file:
+        for line in file:
+            text = line.decode("utf-8").strip()
+            lines += [text] if text and not text.startswith("#") else []
+            if text.startswith("DATA") or len(lines) >= _HEADER_LINES:
+                break
+    head = MetaData.parse_header(lines)
+    if len(head.fields) < len(head.size):
+        raise InputError(
+            f"{path}: {len(head.fields)} of the names of its {len(head.size)} fields can be read: a bracket, # or < in "
+            "a name ends the line: rename the field"
+        )
+    if not len(head.fields) == len(head.size) == len(head.type) == len(head.count):
+        raise ValueError("its header has not as many fields as sizes, types and counts")
+
+
 def read_pcd_heads(paths: list[str]) -> Iterator[Message]:
     """Yield the viewpoint of each PCD file."""
     from pypcd4.pypcd4 import PointCloud
 
     for path in paths:
         with _reads(path, "a PCD file"):
+            _require_whole_names(path)
             viewpoint = [float(number) for number in PointCloud.from_path(path).metadata.viewpoint]
         yield {"viewpoint": viewpoint}, {}
 

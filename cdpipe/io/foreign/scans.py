@@ -91,7 +91,9 @@ class PosedClouds:
                 repeats.require_new(where, name, scan.points_sensor, self.odom_T_sensor[index], stamp_ns)
             yield scan
         if n_missing:
-            told = f"{n_missing} of {n_points} points are (0, 0, 0) or NaN: taken for missing returns and left out"
+            told = (
+                f"{n_missing} of {n_points} points are (0, 0, 0) or not finite: taken for missing returns and left out"
+            )
             warnings.warn(f"{self.name}: {told}", InputWarning, stacklevel=2)
         if n_skewed:
             lack = "there are no two poses with times that rise" if self._motion is None else _NO_SWEEP
@@ -99,7 +101,10 @@ class PosedClouds:
             warnings.warn(f"{self.name}: {told}: {lack} (--no-deskew if they are already)", InputWarning, stacklevel=2)
 
     def _make(self, index: int, cloud: Cloud) -> tuple[PosedScan, int]:
-        """Return a scan, and the number of its missing returns; organised clouds store them as (0, 0, 0) or NaN."""
+        """Return a scan, and the number of its missing returns; organised clouds store them as (0, 0, 0) or NaN.
+
+        Other formats than PLY and KITTI's have their rows with one coordinate that is not finite made NaN by then.
+        """
         where, points = self._clouds.where(index), cloud.points
         is_return = points.any(axis=1) & ~np.isnan(points).all(axis=1)
         if not is_return.any():

@@ -141,7 +141,7 @@ def poses_at(trajectory: Trajectory, stamps_s: Float64Array, name: str) -> Float
     motion = trajectory.motion()
     if motion is None:
         return np.broadcast_to(trajectory.poses[0], (len(stamps_s), 4, 4)).copy()
-    _require_no_gap(trajectory, stamps_s, period_s)
+    _require_no_gap(trajectory, stamps_s)
     return motion.poses(stamps_s)
 
 
@@ -159,15 +159,28 @@ def require_times_of_scans(trajectory: Trajectory, stamps_s: Float64Array | None
         )
 
 
-def _require_no_gap(trajectory: Trajectory, stamps_s: Float64Array, period_s: float) -> None:
+def find_gaps(trajectory: Trajectory, stamps_s: Float64Array) -> tuple[Float64Array, float]:
+    """Return the seconds (S,) between the poses about each scan, and the most that can be bridged.
+
+    Args:
+        trajectory: Poses with rising times.
+        stamps_s: (S,) times of the scans, seconds.
+    """
     assert trajectory.time_s is not None
+    if len(trajectory.time_s) < 2:
+        return np.zeros(len(stamps_s)), _LONGEST_GAP_S
+    period_s = max(_period(stamps_s), _period(trajectory.time_s))
     at = np.clip(np.searchsorted(trajectory.time_s, stamps_s) - 1, 0, len(trajectory.time_s) - 2)
-    steps_s = np.diff(trajectory.time_s)[at]
-    if steps_s.max() > max(_LONGEST_GAP_S, 2 * period_s):
-        scan = int(np.argmax(steps_s))
+    return np.diff(trajectory.time_s)[at], max(_LONGEST_GAP_S, 2 * period_s)
+
+
+def _require_no_gap(trajectory: Trajectory, stamps_s: Float64Array) -> None:
+    gaps_s, longest_s = find_gaps(trajectory, stamps_s)
+    if gaps_s.max() > longest_s:
+        scan = int(np.argmax(gaps_s))
         raise InputError(
-            f"{trajectory.where}: no pose for {steps_s[scan]:.2f} s about scan {scan} ({stamps_s[scan]:.3f} s): at "
-            f"most {max(_LONGEST_GAP_S, 2 * period_s):.2g} s can be bridged: leave those scans out"
+            f"{trajectory.where}: no pose for {gaps_s[scan]:.2f} s about scan {scan} ({stamps_s[scan]:.3f} s): at "
+            f"most {longest_s:.2g} s can be bridged: leave those scans out"
         )
 
 

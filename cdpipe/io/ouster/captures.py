@@ -148,7 +148,10 @@ def open_recording(path: Path, metadata: Path | None = None) -> Recording:
     check_pcap_integrity(path)
     beside = path.with_suffix(".json")
     if metadata is None and not beside.exists():
-        raise InputError(f"{path}: {beside.name} is not beside it: give the sensor's metadata .json with --metadata")
+        raise InputError(
+            f"{path}: {beside.name} is not beside it: give the sensor's metadata .json with --metadata; only Ouster's "
+            "PCAPs are read: those of other sensors as a bag or as PCD"
+        )
     return _open_pcap(path, metadata or beside)
 
 

@@ -286,7 +286,8 @@ class RosMessages:
         that the robot stands in the map; with "registered" the clouds lie in the frame of the odometry. "mounting" has
         no poses, and tf that repeats where the sensor is on the robot. "imu" has odometry of a part beside the sensor,
         "unnamed" poses of the robot that name no frame, "twice" tf that tells the mounting at two times, "wheel" that
-        and a part that turns by no rotation, "frames" clouds that say they are of two sensors.
+        and parts that turn by no rotation, "frames" clouds that say they are of two sensors. With "spin" the sensor
+        turns on the robot, with "leg" the robot on its footprint. With "merged" it stands in odom, which moves.
         """
         made = [
             (topic, "sensor_msgs/msg/PointCloud2", time_s, cloud)
@@ -298,7 +299,7 @@ class RosMessages:
         times = np.arange(self._made.stamps_s[0] - 0.1, min(self._made.stamps_s[-1] + 0.25, last_pose_s), 1 / BASE_HZ)
         base = odom_T_sensor(times) @ invert(BASE_T_SENSOR)
         tf, first = "tf2_msgs/msg/TFMessage", float(times[0])
-        if poses in ("tf", "odometry", "footprint", "standing"):
+        if poses in ("tf", "odometry", "footprint", "standing", "leg", "merged"):
             made.append(("/tf_static", tf, first, self.transform(first, "base_link", "os_lidar", BASE_T_SENSOR)))
         if poses == "imu":
             turned = yaw_pose(np.pi, (0.0, 0.0, 0.04))
@@ -311,10 +312,12 @@ class RosMessages:
                 made.append(("/tf", tf, time_s, self.transform(time_s, "odom", "base_link", pose)))
                 if number in (10, 12):
                     made.append(("/tf", tf, time_s, self.transform(time_s, "base_link", "os_lidar", BASE_T_SENSOR)))
-                if poses == "wheel" and number == 5:
-                    wheel = self.transform(time_s, "base_link", "wheel", np.eye(4))
-                    wheel.transforms[0].transform.rotation.w = 0.0
-                    made.append(("/tf", tf, time_s, wheel))
+                for parent, child in (
+                    (("base_link", "wheel"), ("odom", "base_link")) if (poses, number) == ("wheel", 5) else ()
+                ):
+                    wrong = self.transform(time_s + 0.001, parent, child, np.eye(4))
+                    wrong.transforms[0].transform.rotation.w = 0.0
+                    made.append(("/tf", tf, time_s, wrong))
             elif poses == "imu":
                 at = pose @ BASE_T_SENSOR @ invert(yaw_pose(np.pi, (0.0, 0.0, 0.04))) @ IMU_POSE
                 made.append(("/odom", "nav_msgs/msg/Odometry", time_s, self.odometry(time_s, at, "os_imu")))
@@ -325,6 +328,14 @@ class RosMessages:
                 made.append(
                     ("/tf", tf, time_s, self.transform(time_s, "map", "odom", yaw_pose(0.3, (5.0, time_s, 0.0))))
                 )
+            elif poses in ("spin", "leg", "merged"):
+                parent, child, at = {
+                    "spin": ("spin_base", "os_lidar", pose), "leg": ("base_footprint", "base_link", pose),
+                    "merged": ("map", "odom", pose),
+                }[poses]  # fmt: skip
+                made.append(("/tf", tf, time_s, self.transform(time_s, parent, child, at)))
+                if poses == "merged":
+                    made.append(("/tf", tf, time_s, self.transform(time_s, "odom", "base_link", np.eye(4))))
             elif poses == "mounting":
                 made.append(("/tf", tf, time_s, self.transform(time_s, "base_link", "os_lidar", BASE_T_SENSOR)))
             elif poses in ("odometry", "footprint", "standing", "registered"):
@@ -352,17 +363,31 @@ def write_bag(
     """
     if path.suffix == ".mcap":
         return _write_mcap(path, made, poses, cloud_topics, last_pose_s, **options)
+    messages = RosMessages(made, "ROS1_NOETIC" if path.suffix == ".bag" else "ROS2_HUMBLE")
+    return _write_rosbag(path, messages, messages.all(poses, cloud_topics, last_pose_s))
+
+
+def write_split_bag(folder: Path, made: Drive, names: Sequence[str]) -> Path:
+    """Write parts of one ROS 1 recording with odometry, one file after the other, as `rosbag record --split` does."""
+    folder.mkdir()
+    messages = RosMessages(made, "ROS1_NOETIC")
+    rows = messages.all("odometry", ("/ouster/points",), np.inf)
+    ends = np.linspace(0, len(rows), len(names) + 1).astype(int)
+    for name, start, end in zip(names, ends[:-1], ends[1:], strict=True):
+        _write_rosbag(folder / name, messages, rows[start:end])
+    return folder
+
+
+def _write_rosbag(path: Path, messages: RosMessages, rows: Sequence[tuple[str, str, float, Any]]) -> Path:
     from rosbags.rosbag1 import Writer as Writer1  # noqa: PLC0415
     from rosbags.rosbag2 import Writer as Writer2  # noqa: PLC0415
 
-    is_first = path.suffix == ".bag"
-    messages = RosMessages(made, "ROS1_NOETIC" if is_first else "ROS2_HUMBLE")
+    store, is_first = messages.store, messages.is_first
     with (Writer1 if is_first else Writer2)(path) as bag:
         connections: dict[str, Any] = {}
-        for topic, kind, time_s, message in messages.all(poses, cloud_topics, last_pose_s):
+        for topic, kind, time_s, message in rows:
             if topic not in connections:
-                connections[topic] = bag.add_connection(topic, kind, typestore=messages.store)
-            store = messages.store
+                connections[topic] = bag.add_connection(topic, kind, typestore=store)
             raw = store.serialize_ros1(message, kind) if is_first else store.serialize_cdr(message, kind)
             bag.write(connections[topic], START_NS + round(time_s * 1e9), raw)
     return path

@@ -18,7 +18,7 @@ pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
 from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.geometry import make_pose, transform
 from cdpipe.io.foreign import HowToRead, guess_format
-from cdpipe.io.foreign.bags import _compose, _Edge
+from cdpipe.io.foreign.frames import Edge, compose
 from cdpipe.io.readers import open_session
 from tests.cdpipe.io import foreign_files
 from tests.cdpipe.io.foreign_files import (
@@ -158,8 +158,8 @@ def test_tf_within_the_robot_is_no_way_where_odometry_is(tmp_path: Path) -> None
 def test_a_tf_that_repeats_itself_is_no_movement(tmp_path: Path) -> None:
     assert worst_m(write_bag(tmp_path / "a.bag", MADE, "standing")) < 1e-3
     assert "no poses of the sensor in it" in said(write_bag(tmp_path / "b.bag", MADE, "mounting"))
-    still = _Edge("map", np.array([5.0]), make_pose(np.eye(3), (1.0, 2.0, 4.0))[None])
-    found = _compose("tf", [still, _Edge("base_link", np.array([5.0]), make_pose(np.eye(3), (0.0, 0.0, 0.5))[None])])
+    still = Edge("map", np.array([5.0]), make_pose(np.eye(3), (1.0, 2.0, 4.0))[None])
+    found = compose("tf", [still, Edge("base_link", np.array([5.0]), make_pose(np.eye(3), (0.0, 0.0, 0.5))[None])])
     assert found is not None
     np.testing.assert_allclose(found.poses[:, :3, 3], [[1.0, 2.0, 4.5]])
 
@@ -182,7 +182,7 @@ def test_a_mounting_that_tf_repeats_bounds_no_time(tmp_path: Path) -> None:
 
 def test_transforms_of_a_robot_that_are_no_poses_are_left_out(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "a.bag", MADE, "wheel")
-    with pytest.warns(InputWarning, match="wheel in base_link: 1 of 1 transforms are no poses, and are left out"):
+    with pytest.warns(InputWarning, match=r"base_link in odom: 1 of \d+ transforms are no poses, and are left out"):
         assert worst_m(path) < 1e-3
 
 

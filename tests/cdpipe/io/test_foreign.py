@@ -54,6 +54,27 @@ def test_pcd_scans_are_deskewed_by_their_own_times(tmp_path: Path, encoding: str
     assert worst_m(folder, HowToRead(deskew=False)) > 0.3
 
 
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+@pytest.mark.parametrize("folder", ["run", "run/pcd"])
+def test_a_name_of_a_field_that_cuts_the_header_is_refused(tmp_path: Path, encoding: str, folder: str) -> None:
+    files = sorted(write_pcds(tmp_path / folder, MADE, encoding).glob("*.pcd"))
+    for file in files:
+        file.write_bytes(file.read_bytes().replace(b" intensity time", b" C2C_absolute_distances[<0.3] time", 1))
+    if folder == "run":
+        write_trajectory(tmp_path / "run" / "t.tum", MADE.stamps_s)
+    assert "000000.pcd: 4 of the names of its 5 fields can be read: a bracket, # or <" in said(tmp_path / "run")
+    assert said(files[0]).endswith(": rename the field")
+
+
+def test_points_of_a_pcd_without_one_coordinate_are_missing_returns(tmp_path: Path) -> None:
+    clouds = [(points.copy(), offset_s) for points, offset_s in MADE.clouds]
+    clouds[2][0][[3, 5, 7]] = [(np.nan, 1, 2), (np.inf, 1, 2), (np.nan, np.nan, np.nan)]
+    folder = write_pcds(tmp_path / "run", Drive(MADE.stamps_s, clouds))
+    write_trajectory(folder / "t.tum", MADE.stamps_s)
+    with pytest.warns(InputWarning, match="3 of 5400 points are .* not finite: taken for missing returns and left out"):
+        assert worst_m(folder) < 0.01
+
+
 def test_laz_scans_with_gps_times(tmp_path: Path) -> None:
     folder = write_lases(tmp_path / "run", MADE)
     write_trajectory(folder / "t.csv", MADE.stamps_s, "csv")

@@ -134,7 +134,7 @@ def test_missing_returns_of_organised_clouds_are_dropped_and_said(tmp_path: Path
     source = open_session(folder)
     with pytest.warns(InputWarning) as caught:
         _, scan, _ = source.scans()
-    told = f"{folder}: 2 of 8 points are (0, 0, 0) or NaN: taken for missing returns and left out"
+    told = f"{folder}: 2 of 8 points are (0, 0, 0) or not finite: taken for missing returns and left out"
     assert [str(each.message) for each in caught] == [told]
     np.testing.assert_array_equal(scan.points_sensor, [(1, 2, 3), (0, 0, 4)])
     # a return is named by the row of its file

@@ -166,6 +166,25 @@ def test_the_stamp_of_a_header_comes_before_the_time_of_recording(tmp_path: Path
     np.testing.assert_allclose(read_poses(tmp_path / "t.csv").time_s, [1_700_000_000.5])
 
 
+def test_a_csv_of_rostopic_echo_is_read(tmp_path: Path) -> None:
+    head = ["field.header.seq", "field.header.stamp", "field.header.frame_id", "field.child_frame_id"]
+    place = [f"field.pose.pose.position.{axis}" for axis in "xyz"]
+    turn = [f"field.pose.pose.orientation.{axis}" for axis in "xyzw"]
+    twist = [f"field.twist.twist.{kind}.{axis}" for kind in ("linear", "angular") for axis in "xyz"]
+    spreads = [[f"field.{kind}.covariance{number}" for number in range(36)] for kind in ("pose", "twist")]
+    names = ["%time", *head, *place, *turn, *spreads[0], *twist, *spreads[1]]
+    stamp_ns = 1_700_000_000_500_000_000
+    numbers = [1, 2, 3, 0, 0, 0.6, 0.8, *[0.01] * 36, *[9.0] * 6, *[0.02] * 36]
+    rows = [
+        f"{n + 80_000_000},7,{n},odom,base_link,{','.join(map(str, numbers))}" for n in (stamp_ns, stamp_ns + 10**8)
+    ]
+    (tmp_path / "t.csv").write_text("\n".join([",".join(names), *rows]) + "\n")
+    found = read_poses(tmp_path / "t.csv")
+    np.testing.assert_allclose(found.time_s, [1_700_000_000.5, 1_700_000_000.6])
+    np.testing.assert_array_equal(found.poses[0, :3, 3], [1, 2, 3])
+    np.testing.assert_allclose(found.poses[0, :3, 0], [0.8**2 - 0.6**2, 2 * 0.6 * 0.8, 0.0], atol=1e-12)
+
+
 def test_a_commented_header_without_commas_tells_the_order(tmp_path: Path) -> None:
     (tmp_path / "t.txt").write_text("# from SLAM\n# timestamp tx ty tz qw qx qy qz\n1 1 2 3 0.6 0 0 0.8\n")
     (pose,) = read_poses(tmp_path / "t.txt").poses

@@ -167,7 +167,9 @@ def test_a_pcap_that_lost_packets_keeps_the_rest(capture: Path, tmp_path: Path) 
 def test_metadata_of_a_pcap(capture: Path, tmp_path: Path) -> None:
     moved = tmp_path / "elsewhere.json"
     capture.with_suffix(".json").rename(moved)
-    assert "c.json" in said(lambda: open_recording(capture))
+    told = said(lambda: open_recording(capture))
+    assert "c.json is not beside it" in told
+    assert told.endswith("only Ouster's PCAPs are read: those of other sensors as a bag or as PCD")
     assert len(list(open_recording(capture, moved).revolutions())) == 3
     fewer = tmp_path / "fewer.json"
     fewer.write_text(info_of(load_profile("os1-32-g", "1024x10")).to_json_string())
