@@ -121,6 +121,8 @@ def _recorded_mistakes(tree: Any) -> Iterator[Mistake]:
     for name in _RECORDED:
         if tree.get(name):
             yield (name,), f"the recording has its own: leave {name} out"
+    if tree.get("sim"):
+        yield ("sim",), "no ray of a recording is simulated, and its props are cast with embree: leave sim out"
     for key, place in _places({"props": tree.get("props")}):
         for name, (nothing, why) in _NOT_RECORDED.items():
             if place.get(name, nothing) not in (nothing, None):

@@ -143,7 +143,7 @@ class GraftScenario(Scenario):
 
 
 def take_props(scenario: dict[Any, Any]) -> dict[Any, Any]:
-    """Return the plain tree of any scenario without its world: only props, without their places between nodes."""
+    """Return the plain tree of any scenario without its world: only props, without their places in its tunnel."""
     own = ("family", "description", "score_radius_m", "frozen", "turnover")
     kept = {key: scenario[key] for key in own if key in scenario}
     props = scenario.get("props") or []
@@ -151,7 +151,7 @@ def take_props(scenario: dict[Any, Any]) -> dict[Any, Any]:
 
 
 def _free(prop: Any) -> Any:
-    """Return the plain tree of a prop with places that a recording can have."""
+    """Return the plain tree of a prop without the places that only its tunnel has; a move stays one."""
     if not isinstance(prop, dict):
         return prop
     freed = dict(prop)
@@ -159,5 +159,5 @@ def _free(prop: Any) -> Any:
         freed["one_of"] = [_free(option) for option in freed["one_of"]]
     for key in ("place", "to"):
         if isinstance(freed.get(key), dict):
-            freed[key] = {name: freed[key][name] for name in ("at", "yaw_deg") if name in freed[key]}
+            freed[key] = {name: value for name, value in freed[key].items() if name == "yaw_deg"}
     return freed

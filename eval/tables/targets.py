@@ -166,9 +166,10 @@ def _with_sensor(target: Target, variant: str, results: pd.DataFrame, odometry: 
     values = of_pairs(target.sensor)
     if target.less_sensor:
         values = (values - of_pairs(target.less_sensor)).dropna()
-    value, _, _, n = mean_with_interval(values.to_numpy(dtype=np.float64))
+    figures = np.asarray(values, dtype=np.float64)
+    value, _, _, n = mean_with_interval(figures)
     tunnels = tunnel_numbers(values.index.get_level_values(0), values.index.get_level_values(1))
-    low, high = interval_over_tunnels(values.to_numpy(dtype=np.float64), tunnels)
+    low, high = interval_over_tunnels(figures, tunnels)
     return {"domain": target.sensor, "value": value, "low": low, "high": high, "n": n}
 
 

@@ -49,7 +49,7 @@ USUAL_MOVERS: dict[str, dict[str, Any]] = {
 
 
 # Half a step is shorter than the leg up to this speed of a person of 1 m, and goes with the square of the height:
-# `sim.movers.person` has steps of the root of 0.387 s times the speed, and legs of 0.484 of the height.
+# `sim.movers.person` has steps of the root of 0.387 m s times the speed, and legs of 0.484 of the height.
 _FASTEST_MPS = 2.4154
 
 

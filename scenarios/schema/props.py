@@ -36,7 +36,7 @@ class Place(Settings):
     fraction: Share | None = None  # of the way between the two nodes
     at: tuple[Finite, Finite, Finite] | None = None  # world; the floor is looked for below it
     area: str | None = None
-    lateral: SignedShare = 0.0  # -1 right wall, +1 left wall, of the width the prop leaves free
+    lateral: SignedShare = 0.0  # -1 right wall, +1 left wall, of the width the prop leaves free; not with `at`
     yaw_deg: Finite = 0.0  # against the direction of the drift; with `at` against the x axis
     posture: Literal["upright", "tipped", "leaning"] = "upright"  # leaning: against the nearer wall; a pile: banked up
 
@@ -46,6 +46,8 @@ class Place(Settings):
             raise ValueError("between and fraction go together")
         if sum(way is not None for way in (self.between, self.at, self.area)) > 1:
             raise ValueError("give one of between, at and area")
+        if self.at is not None and self.lateral:
+            raise ValueError(f"lateral = {self.lateral:g}: at says where across the drift, too: leave lateral out")
         return self
 
 

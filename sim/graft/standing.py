@@ -88,7 +88,8 @@ def _find_place(
     told = ", ".join(f"{number} times {why}" for why, number in sorted(reasons.items(), key=lambda each: -each[1]))
     raise ScenarioError(
         f"prop {item.prop.name!r} finds no place in {sum(reasons.values())} tries ({told}): make it smaller, "
-        "graft fewer props, raise reach_m (--reach) or lower clearance_m (--clearance) of the recording, or give place.at"
+        "graft fewer props, raise reach_m (--reach) or lower clearance_m (--clearance) of the recording, or give "
+        "place.at"
     )
 
 

@@ -80,11 +80,27 @@ class Extent:
         """Radius of the ball around the box."""
         return float(np.linalg.norm(self.high - self.low)) / 2
 
-    @property
-    def footprint(self) -> Float64Array:
-        """(4, 2) corners of the box from above, counter-clockwise."""
-        (x0, y0, _), (x1, y1, _) = self.low, self.high
-        return np.array([[x1, y1], [x0, y1], [x0, y0], [x1, y0]])
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reach:
+    """How far a body reaches over all moments of its movement, by the curvature of its line, root frame.
+
+    Attributes:
+        bend_per_m: (K,) rising curvatures, to the left positive.
+        low, high: (K, 3) corners of its bounding box there, metres.
+    """
+
+    bend_per_m: Float64Array
+    low: Float64Array
+    high: Float64Array
+
+    def at(self, bend_per_m: Float64Array) -> tuple[Float64Array, Float64Array]:
+        """Return the low and the high corner (N, 3) of its box at curvatures (N,)."""
+        low, high = (
+            np.stack([np.interp(bend_per_m, self.bend_per_m, values) for values in corner.T], axis=-1)
+            for corner in (self.low, self.high)
+        )
+        return low, high
 
 
 class Body(ABC):
@@ -93,28 +109,31 @@ class Body(ABC):
     Attributes:
         links: Its rigid parts.
         period: Period of its movement in way (metres, for what walks) and in time (seconds); sampled for its extent.
+        is_bending: Whether it bends with its line.
     """
 
     links: tuple[Link, ...]
     period: tuple[float, float]
+    is_bending: bool = False
 
     @abstractmethod
     def place_links(self, moment: Moment) -> Float64Array:
         """Return root_T_link (P, T, 4, 4) of every link at T times."""
 
 
-def sample_moments(body: Body) -> Moment:
-    """Return moments over one period of a body, level and straight on, standing, moving and at either end."""
+def sample_moments(body: Body, bend_per_m: float = 0.0) -> Moment:
+    """Return moments over one period of a body, level, on a line that bends so, standing, moving and at either end."""
     share = np.arange(_SAMPLES) / _SAMPLES
     zero = np.zeros(3 * _SAMPLES)
     activity = np.repeat([0.0, 1.0, 1.0], _SAMPLES)
     turned = np.concatenate([share, np.zeros(_SAMPLES), np.ones(_SAMPLES)])
-    return Moment(np.tile(share, 3) * body.period[1], np.tile(share, 3) * body.period[0], activity, turned, zero, zero)
+    time_s, way_m = np.tile(share, 3) * body.period[1], np.tile(share, 3) * body.period[0]
+    return Moment(time_s, way_m, activity, turned, zero, zero + bend_per_m)
 
 
-def measure_extent(body: Body, meshes: Sequence[Sequence[Mesh]]) -> Extent:
-    """Return how far a body reaches, from the meshes of each of its links in the link's frame."""
-    poses = body.place_links(sample_moments(body))
+def measure_extent(body: Body, meshes: Sequence[Sequence[Mesh]], bend_per_m: float = 0.0) -> Extent:
+    """Return how far a body reaches on a line that bends so, from the meshes of its links, each in the link's frame."""
+    poses = body.place_links(sample_moments(body, bend_per_m))
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for of_link, root_T_link in zip(meshes, poses, strict=True):
         corners = np.concatenate([mesh.vertices for mesh in of_link])

@@ -74,6 +74,12 @@ class Course:
         eased = share * share * (3.0 - 2.0 * share)
         return np.where(is_back, self.length_m - gone_m, gone_m), np.where(is_back, 1.0 - eased, eased)
 
+    def pass_times(self, step_m: float) -> Float64Array:
+        """Return times (T,) since it left the start at which it is at places every `step_m` or less, out and back."""
+        n_steps = max(1, int(np.ceil(self.length_m / step_m)))
+        out_s = np.linspace(0.0, self.length_m / self.speed_mps, n_steps + 1)
+        return np.concatenate([out_s, self.period_s / 2 + out_s])
+
     def moment(self, time_s: Float64Array) -> Moment:
         """Return what the body does at times (T,)."""
         along_m, turned = self.find_place(time_s)

@@ -40,6 +40,8 @@ class Forklift(Body):
 class Loader(Body):
     """A loader that faces +x, root at its joint; it carries its bucket high on the way back, with muck in it."""
 
+    is_bending = True
+
     def __init__(self, size_m: Size) -> None:
         length, _, height = size_m
         self.links = (

@@ -11,8 +11,10 @@ from scenarios.schema import Mover
 from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 from sim.materials import REFLECTIVITY
-from sim.movers.body import Body, Extent, compile_links, compose_poses, measure_extent
+from sim.movers.body import Body, Extent, Reach, compile_links, compose_poses, measure_extent
 from sim.movers.course import Course
+
+_BENDS = 9  # curvatures, from the sharpest bend to the right to that to the left, at which a reach is measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +40,7 @@ class Figure:
     Attributes:
         body: The body.
         limbs: The surfaces of each of its links.
-        extent: How far it reaches over all its movement, root frame.
+        extent: How far it reaches over all its movement, straight on, root frame.
         materials: Material of each solid, link by link.
         reflectivity: (G,) share of light that each solid reflects.
     """
@@ -74,6 +76,18 @@ class MovingBody:
         """Return the pose (P, T, 4, 4) of each link at times (T,) of the session."""
         root_T_link = self.figure.body.place_links(self.course.moment(time_s))
         return compose_poses(self.world_T_root(time_s)[None], root_T_link)
+
+    def measure_reach(self) -> Reach:
+        """Return how far it reaches on its course: on a bend at least as far as straight on."""
+        figure, bend_per_m = self.figure, self.course.bend_per_m
+        straight = figure.extent
+        if not figure.body.is_bending or not bend_per_m.any():
+            return Reach(np.zeros(1), straight.low[None], straight.high[None])
+        bends = np.linspace(min(bend_per_m.min(), 0.0), max(bend_per_m.max(), 0.0), _BENDS)
+        meshes = [limb.meshes for limb in figure.limbs]
+        extents = [measure_extent(figure.body, meshes, bend) for bend in bends.tolist()]
+        low, high = np.stack([each.low for each in extents]), np.stack([each.high for each in extents])
+        return Reach(bends, np.minimum(low, straight.low), np.maximum(high, straight.high))
 
 
 def make_figure(body: Body, reflectivity: float | None) -> Figure:

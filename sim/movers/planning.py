@@ -12,6 +12,7 @@ from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, stream, transform
 from cdpipe.core.geometry.motion import Motion
 from scenarios.schema import Mover, Scenario
+from sim.movers.body import Reach
 from sim.movers.course import Course, stay
 from sim.movers.kinds import build_body
 from sim.movers.line import Stand, drive_along, hang, lay_line, walk_along
@@ -31,7 +32,7 @@ _ALONG_M = 0.25  # between the places at which a mover is checked against props,
 _WATCH_S = 0.1  # between the times at which its distance to the sensor is measured
 _DEEPEST_M = 0.05  # of a corner of it in rock, feet and tyres aside
 _FOOT_M = 0.25
-_OTHER_LEVEL_M = 4.0  # farther above or below than this, a mover is on another level of the mine
+_OTHER_LEVEL_M = 4.0  # what is farther above or below a mover than this is on another level of the mine
 _SWAY_RAD = np.deg2rad(1.0)
 
 
@@ -118,8 +119,9 @@ def _fit(body: MovingBody, starts: Float64Array, site: _Site) -> MovingBody:
     Raises:
         ScenarioError: It cannot.
     """
-    _refuse_contact(body, site)
-    return _start_clear(body, starts, site)
+    reach = body.measure_reach()
+    _refuse_contact(body, reach, site)
+    return _start_clear(body, reach, starts, site)
 
 
 def _draw_stands(mover: Mover, site: _Site, seed: int, generator: np.random.Generator) -> Iterator[Stand]:
@@ -175,19 +177,21 @@ def _settle(
     return figure, drive_along(path, mover.speed_mps, mover.pause_s, extent, fixed)
 
 
-def _refuse_contact(body: MovingBody, site: _Site) -> None:
+def _refuse_contact(body: MovingBody, reach: Reach, site: _Site) -> None:
     """Refuse a course on which a mover touches a prop of its session, or reaches into rock.
 
     Raises:
         ScenarioError: With the prop, or the depth.
     """
-    footprints = sweep_footprints(body.course, body.figure.extent.footprint, _ALONG_M)
+    footprints = sweep_footprints(body.course, reach, _ALONG_M)
     level_m = body.course.points[:, 2]
+    lowest_m = level_m.min() + reach.low[:, 2].min() - _OTHER_LEVEL_M
+    highest_m = level_m.max() + reach.high[:, 2].max() + _OTHER_LEVEL_M
     for item in site.world.standing:
         if site.session not in item.sessions:
             continue
         low, high = standing_box(item)
-        if high[2] < level_m.min() - _OTHER_LEVEL_M or low[2] > level_m.max() + _OTHER_LEVEL_M:
+        if high[2] < lowest_m or low[2] > highest_m:
             continue
         outline = grow_rectangle(standing_corners(item), _PROP_GAP_M)
         if any(rectangles_overlap(footprint, outline) for footprint in footprints):
@@ -197,19 +201,21 @@ def _refuse_contact(body: MovingBody, site: _Site) -> None:
         raise ScenarioError(f"it would reach {depth_m:.2f} m into rock or furniture")
 
 
-def sweep_footprints(course: Course, footprint: Float64Array, step_m: float) -> Float64Array:
-    """Return the outlines (N, 4, 2) of a footprint (4, 2) every `step_m` along a course, in both directions."""
+def sweep_footprints(course: Course, reach: Reach, step_m: float) -> Float64Array:
+    """Return the outlines (N, 4, 2) of a mover every `step_m` along its course, in both directions."""
     places = np.unique(np.append(np.arange(0.0, course.length_m, step_m), course.length_m))
     x, y, yaw = (np.interp(places, course.distance_m, each) for each in (*course.points.T[:2], course.yaw_rad))
     turned = np.concatenate([yaw, yaw + np.pi]) if course.is_turning or not course.is_moving else yaw
     middle = np.tile(np.column_stack([x, y]), (len(turned) // len(yaw), 1))
-    return _outlines(footprint, middle, turned)
+    bend_per_m = np.tile(np.interp(places, course.distance_m, course.bend_per_m), len(turned) // len(yaw))
+    return _outlines(*reach.at(bend_per_m), middle, turned)
 
 
-def _outlines(footprint: Float64Array, middle: Float64Array, yaw_rad: Float64Array) -> Float64Array:
-    """Return a footprint (4, 2) at places (N, 2) turned by angles (N,): (N, 4, 2)."""
+def _outlines(low: Float64Array, high: Float64Array, middle: Float64Array, yaw_rad: Float64Array) -> Float64Array:
+    """Return the corners (N, 4, 2) of boxes (N, 3) from above at places (N, 2) turned by angles (N,)."""
     cos, sin = np.cos(yaw_rad)[:, None], np.sin(yaw_rad)[:, None]
-    x, y = footprint.T
+    x = np.stack([high[:, 0], low[:, 0], low[:, 0], high[:, 0]], axis=1)
+    y = np.stack([high[:, 1], high[:, 1], low[:, 1], low[:, 1]], axis=1)
     return np.stack([middle[:, :1] + cos * x - sin * y, middle[:, 1:] + sin * x + cos * y], axis=-1)
 
 
@@ -217,7 +223,9 @@ def _measure_depth(body: MovingBody, site: _Site) -> float:
     """Return how deep any corner of a mover reaches into rock on its course, feet and tyres aside, metres."""
     course = body.course
     n_places = max(2, int(np.ceil(course.length_m / (4 * _ALONG_M))))
-    time_s = course.period_s * (np.arange(n_places) + 0.5) / n_places
+    time_s = course.period_s * (np.arange(n_places) + 0.5) / n_places  # in the pauses, too
+    if course.is_moving:
+        time_s = np.concatenate([time_s, course.pass_times(4 * _ALONG_M)])
     corners = []
     for limb, poses in zip(body.figure.limbs, body.world_T_links(time_s), strict=True):
         of_limb = np.concatenate([mesh.vertices for mesh in limb.meshes])
@@ -229,7 +237,7 @@ def _measure_depth(body: MovingBody, site: _Site) -> float:
     return float(find_way_out(points, site.world.fixed)[0].max(initial=0.0))
 
 
-def _start_clear(body: MovingBody, starts: Float64Array, site: _Site) -> MovingBody:
+def _start_clear(body: MovingBody, reach: Reach, starts: Float64Array, site: _Site) -> MovingBody:
     """Return a mover that starts when it keeps clear of the robot; each start is a share of its period.
 
     Raises:
@@ -239,7 +247,7 @@ def _start_clear(body: MovingBody, starts: Float64Array, site: _Site) -> MovingB
     best_m, best = -1.0, site.robot[0]
     for start in starts.tolist():
         course = replace(body.course, offset_s=float(start * body.course.period_s))
-        gap_m = measure_gaps(course, body.figure.extent.footprint, site.robot_s, site.robot)
+        gap_m = measure_gaps(course, reach, site.robot_s, site.robot)
         worst = int(np.argmin(gap_m))
         if gap_m[worst] >= needed_m:
             return replace(body, course=course)
@@ -251,8 +259,8 @@ def _start_clear(body: MovingBody, starts: Float64Array, site: _Site) -> MovingB
     )
 
 
-def measure_gaps(course: Course, footprint: Float64Array, time_s: Float64Array, robot: Float64Array) -> Float64Array:
-    """Return the level distance (N,) from the robot (N, 3) to a footprint (4, 2) on its course at times (N,), metres.
+def measure_gaps(course: Course, reach: Reach, time_s: Float64Array, robot: Float64Array) -> Float64Array:
+    """Return the level distance (N,) from the robot (N, 3) to a mover's box on its course at times (N,), metres.
 
     It is infinite while one is on another level of the mine.
     """
@@ -262,8 +270,9 @@ def measure_gaps(course: Course, footprint: Float64Array, time_s: Float64Array, 
     heading /= np.linalg.norm(heading, axis=1, keepdims=True)
     x = heading[:, 0] * delta[:, 0] + heading[:, 1] * delta[:, 1]
     y = heading[:, 0] * delta[:, 1] - heading[:, 1] * delta[:, 0]
-    low, high = footprint.min(axis=0), footprint.max(axis=0)
-    outside_x = np.maximum(np.maximum(low[0] - x, x - high[0]), 0.0)
-    outside_y = np.maximum(np.maximum(low[1] - y, y - high[1]), 0.0)
-    gap_m = np.hypot(outside_x, outside_y)
-    return np.where(np.abs(delta[:, 2]) > _OTHER_LEVEL_M, np.inf, gap_m)
+    low, high = (corner.T for corner in reach.at(course.moment(time_s).bend_per_m))
+    outside_x, outside_y, outside_z = (
+        np.maximum(np.maximum(low[axis] - along, along - high[axis]), 0.0)
+        for axis, along in enumerate((x, y, delta[:, 2]))
+    )
+    return np.where(outside_z > _OTHER_LEVEL_M, np.inf, np.hypot(outside_x, outside_y))

@@ -34,11 +34,10 @@ def simulate_afters(scenario: Scenario, plans: Sequence[SessionPlan], seed: int)
 
     Raises:
         InputError: The sensor profile or another file cannot be read.
-        ScenarioError: The world contradicts itself, a drive finds no way, rock changes in the scenario, or a curtain
-            would hang elsewhere in one of the sessions.
+        ScenarioError: The world contradicts itself, a drive finds no way, rock changes in the scenario, the odometry
+            of a further session is a file, or a curtain would hang elsewhere in one of the sessions.
     """
-    if scenario.surface and plans:
-        raise ScenarioError("surface: where rock changes, one after session is simulated: leave out `--afters`")
+    _refuse_unsuited(scenario, plans)
     files, world = file_digests(scenario), build_world(scenario, seed)
     before, after = plan_drives_in(world, scenario, seed)
     further = [
@@ -56,6 +55,17 @@ def simulate_afters(scenario: Scenario, plans: Sequence[SessionPlan], seed: int)
             sessions = {"before": held, "after": hold_session(drives[1], pool)}
             yield HeldPair(
                 collect_truth(own, seed, drives, files), {name: sessions[name] for name in ("before", "after")}
+            )
+
+
+def _refuse_unsuited(scenario: Scenario, plans: Sequence[SessionPlan]) -> None:
+    if scenario.surface and plans:
+        raise ScenarioError("surface: where rock changes, one after session is simulated: leave out `--afters`")
+    for plan in plans:
+        if plan.odometry.file is not None:
+            raise ScenarioError(
+                f"after.odometry.file = {plan.odometry.file}: the poses of one drive, and each further after session "
+                "has a drive of its own: give an odometry.source, or leave out `--afters`"
             )
 
 

@@ -78,6 +78,7 @@ def test_the_digest_of_a_recording_is_that_of_its_content(tmp_path: Path) -> Non
         ("recording: {sessions: [drive.osf], odometry: kiss-icp, trajectories: [drive.osf]}", "both give the poses"),
         ("recording: {sessions: [drive.osf], reach_m: 0.5}", "expected more than clearance_m"),
         ("recording: {sessions: [drive.osf]}\nsensor: {mode: 512x10}", "the recording has its own: leave sensor out"),
+        ("recording: {sessions: [drive.osf]}\nsim: {backend: warp}", "sim = .*: no ray of .*: leave sim out"),
         (
             "recording: {sessions: [drive.osf]}\n"
             "props: [{name: a, kind: box, size_m: [1, 1, 1], place: {posture: tipped}}]",
@@ -142,6 +143,15 @@ def test_of_a_scenario_with_a_tunnel_the_props_count_alone(tmp_path: Path) -> No
     assert all(prop.place == Place(yaw_deg=prop.place.yaw_deg) for prop in drawn.props)
     assert load_grafted("none", recording, 5).props == ()
     assert all(prop.change == "none" for prop in load_grafted("unchanged/narrow", recording, 5).props)
+
+
+@pytest.mark.parametrize("form", ["{}", "one_of: [{{{}}}]"])
+def test_a_point_of_a_tunnel_is_no_place_in_a_recording(tmp_path: Path, form: str) -> None:
+    world = "tunnel: {nodes: {a: [0, 0, 0], b: [9, 0, 0]}, drifts: [{nodes: [a, b]}]}\nsim: {backend: warp}\n"
+    places = form.format("place: {at: [2, 0, 0], yaw_deg: 30}, to: {at: [5, 0, 0]}")
+    path = write(tmp_path, f"{world}props: [{{name: box, kind: box, size_m: [1, 1, 1], change: moved, {places}}}]\n")
+    (box,) = load_grafted(path, {"sessions": [str(tmp_path / "drive.osf")]}, 3).props
+    assert (box.place, box.to) == (Place(yaw_deg=30), Place())
 
 
 @pytest.mark.parametrize("name", ["train/narrow", "train/network"])

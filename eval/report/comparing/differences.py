@@ -64,7 +64,7 @@ def compare(a: Side, b: Side, *, times_count: bool = True, seed: int = 0) -> pd.
     rows: list[dict[str, Any]] = []
     for variants in matched_variants(a, b):
         own = [frame[frame["variant"] == name] for frame, name in zip(figures, variants, strict=True)]
-        for scope, where, pairs in _groups(*own, of_plan):
+        for scope, where, pairs in _groups(own[0], own[1], of_plan):
             names = {"scope": scope, "where": where, "variant_a": variants[0], "variant_b": variants[1]}
             first, second = (_stated(frame.set_index(PAIR).loc[pairs]) for frame in own)
             found = paired_differences(first, second, seed)

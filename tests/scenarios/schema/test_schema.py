@@ -9,7 +9,18 @@ from pydantic import ValidationError
 
 from cdpipe.sensor.ouster import load_profile, profile_names
 from scenarios import check_scenario
-from scenarios.schema import FITTED_WALK, GAITS, MeshFile, Odometry, Platform, Prop, Scenario, Sensor, SessionPlan
+from scenarios.schema import (
+    FITTED_WALK,
+    GAITS,
+    MeshFile,
+    Odometry,
+    Place,
+    Platform,
+    Prop,
+    Scenario,
+    Sensor,
+    SessionPlan,
+)
 from sim.drive.trajectory import load_sensor
 
 
@@ -29,6 +40,7 @@ from sim.drive.trajectory import load_sensor
         (Platform, {"gait": {}}, "step_hz"),
         (Platform, {"gait": GAITS["legged"]}, "a ground_robot has no gait"),
         (Platform, {"mount_pitch_deg": 31}, "less than or equal to 30"),
+        (Place, {"at": [1, 2, 0], "lateral": -0.5}, "lateral = -0.5: .*: leave lateral out"),
         (Sensor, {"min_range_m": 20, "max_range_m": 5}, "leaves nothing below max_range_m"),
         (
             Prop,

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -139,9 +140,29 @@ def test_the_extent_holds_every_moment(kind: str, make_body: MakeBody) -> None:
             assert (moved > extent.low).all() and (moved < extent.high).all()
 
 
+@pytest.mark.parametrize("bend_per_m", [-0.15, 0.15])
+@pytest.mark.parametrize("kind", ["person", "forklift", "loader"])
+def test_the_reach_of_a_mover_holds_every_moment_on_a_bend(kind: str, bend_per_m: float, make_body: MakeBody) -> None:
+    body = make_body(kind)
+    way = body.course.distance_m / body.course.length_m
+    bent = replace(body, course=replace(body.course, bend_per_m=bend_per_m * way))
+    extent, reach = body.figure.extent, bent.measure_reach()
+    moment = bent.course.moment(np.random.default_rng(3).uniform(0, 200, 400))
+    boxes = list(zip(*reach.at(moment.bend_per_m), strict=True))
+    for limb, poses in zip(bent.figure.limbs, bent.figure.body.place_links(moment), strict=True):
+        corners = np.concatenate([mesh.vertices for mesh in limb.meshes])
+        for pose, (low, high) in zip(poses, boxes, strict=True):
+            moved = transform(pose, corners)
+            assert (moved > low).all() and (moved < high).all()
+    for bend, is_wider in ((0.0, False), (bend_per_m, kind == "loader")):
+        low, high = (corner[0] for corner in reach.at(np.array([bend])))
+        assert (low <= extent.low).all() and (high >= extent.high).all()
+        assert bool((high - low)[1] > (extent.high - extent.low)[1] + 0.5) == is_wider
+
+
 @pytest.mark.parametrize("height_m", [1.2, 1.75, 2.2])
 def test_a_person_walks_as_fast_as_half_a_step_reaches_and_no_faster(height_m: float) -> None:
-    # half of a step, the root of speed times 0.3873 s, over 0.985 of the leg, 0.491 of the height
+    # half of a step, the root of speed times 0.3873 m s, over 0.985 of the leg, 0.491 of the height
     fastest_mps = (2 * 0.985 * 0.491 * height_m) ** 2 / (60 * 62 / 98**2)
     told = {"name": "runner", "kind": "person", "height_m": height_m}
     assert Mover(**told, speed_mps=0.999 * fastest_mps).height_m == height_m

@@ -55,3 +55,10 @@ def test_a_body_that_stays_is_always_there_and_a_standing_person_sways(make_body
 def test_time_goes_on_between_recorded_revolutions(make_body: MakeBody) -> None:
     late, early = make_body("person", offset_s=3.5), make_body("person")
     np.testing.assert_allclose(late.world_T_links(np.array([1.0])), early.world_T_links(np.array([4.5])), atol=1e-12)
+
+
+def test_a_body_passes_every_metre_of_its_way_out_and_back(make_body: MakeBody) -> None:
+    course = make_body("forklift", speed_mps=2.5, pause_s=500.0).course
+    along_m, turned = course.find_place(course.pass_times(1.1))
+    np.testing.assert_allclose(along_m, [*np.arange(11.0), *np.arange(10.0, -1.0, -1.0)], atol=1e-9)
+    np.testing.assert_allclose(turned, np.repeat([0.0, 1.0], 11), atol=1e-9)

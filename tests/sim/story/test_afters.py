@@ -10,6 +10,7 @@ import pytest
 
 from cdpipe.core.errors import ScenarioError
 from scenarios.library import load_scenario
+from scenarios.schema import Odometry
 from sim.movers.mover import MovingBody
 from sim.session.simulate import HeldPair, simulate_in_memory
 from sim.story.afters import simulate_afters
@@ -75,3 +76,10 @@ def test_changing_rock_is_refused() -> None:
     scenario = load_scenario("surface/scar", SEED)
     with pytest.raises(ScenarioError, match="--afters"):
         next(simulate_afters(scenario, [scenario.after], SEED))
+
+
+def test_poses_of_one_drive_are_refused_for_another() -> None:
+    scenario = load_scenario(FAMILY, SEED)
+    told = scenario.after.model_copy(update={"odometry": Odometry(file="own.tum")})
+    with pytest.raises(ScenarioError, match=r"after\.odometry\.file = own\.tum: .*: give an odometry\.source"):
+        next(simulate_afters(scenario, [scenario.after, told], SEED))
