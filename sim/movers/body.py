@@ -23,6 +23,8 @@ from sim.props.shapes import Solid
 # Moments at which a body's extent is measured, and what is added to it for the moments between them.
 _SAMPLES = 96
 _SPARE_M = 0.03
+# Curvatures of a line at which the reach of what bends is measured; between them it is 1.5 cm off at most.
+_BENDS_PER_M = np.linspace(-0.5, 0.5, 11)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,6 +142,15 @@ def measure_extent(body: Body, meshes: Sequence[Sequence[Mesh]], bend_per_m: flo
         moved = corners @ np.swapaxes(root_T_link[:, :3, :3], 1, 2) + root_T_link[:, None, :3, 3]
         low, high = np.minimum(low, moved.min(axis=(0, 1))), np.maximum(high, moved.max(axis=(0, 1)))
     return Extent(low - _SPARE_M, high + _SPARE_M)
+
+
+def measure_reach(body: Body, meshes: Sequence[Sequence[Mesh]], straight: Extent) -> Reach:
+    """Return how far a body reaches on lines that bend, at least as far as straight on."""
+    if not body.is_bending:
+        return Reach(np.zeros(1), straight.low[None], straight.high[None])
+    extents = [measure_extent(body, meshes, bend) for bend in _BENDS_PER_M.tolist()]
+    low, high = np.stack([each.low for each in extents]), np.stack([each.high for each in extents])
+    return Reach(_BENDS_PER_M, np.minimum(low, straight.low), np.maximum(high, straight.high))
 
 
 def compile_links(links: Sequence[Link]) -> list[list[Mesh]]:

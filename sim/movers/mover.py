@@ -11,10 +11,8 @@ from scenarios.schema import Mover
 from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 from sim.materials import REFLECTIVITY
-from sim.movers.body import Body, Extent, Reach, compile_links, compose_poses, measure_extent
+from sim.movers.body import Body, Extent, Reach, compile_links, compose_poses, measure_extent, measure_reach
 from sim.movers.course import Course
-
-_BENDS = 9  # curvatures, from the sharpest bend to the right to that to the left, at which a reach is measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +39,7 @@ class Figure:
         body: The body.
         limbs: The surfaces of each of its links.
         extent: How far it reaches over all its movement, straight on, root frame.
+        reach: How far it reaches on lines that bend.
         materials: Material of each solid, link by link.
         reflectivity: (G,) share of light that each solid reflects.
     """
@@ -48,6 +47,7 @@ class Figure:
     body: Body
     limbs: tuple[Limb, ...]
     extent: Extent
+    reach: Reach
     materials: tuple[str, ...]
     reflectivity: Float32Array
 
@@ -77,18 +77,6 @@ class MovingBody:
         root_T_link = self.figure.body.place_links(self.course.moment(time_s))
         return compose_poses(self.world_T_root(time_s)[None], root_T_link)
 
-    def measure_reach(self) -> Reach:
-        """Return how far it reaches on its course: on a bend at least as far as straight on."""
-        figure, bend_per_m = self.figure, self.course.bend_per_m
-        straight = figure.extent
-        if not figure.body.is_bending or not bend_per_m.any():
-            return Reach(np.zeros(1), straight.low[None], straight.high[None])
-        bends = np.linspace(min(bend_per_m.min(), 0.0), max(bend_per_m.max(), 0.0), _BENDS)
-        meshes = [limb.meshes for limb in figure.limbs]
-        extents = [measure_extent(figure.body, meshes, bend) for bend in bends.tolist()]
-        low, high = np.stack([each.low for each in extents]), np.stack([each.high for each in extents])
-        return Reach(bends, np.minimum(low, straight.low), np.maximum(high, straight.high))
-
 
 def make_figure(body: Body, reflectivity: float | None) -> Figure:
     """Return a body with its surfaces; a reflectivity replaces those of its materials."""
@@ -96,7 +84,9 @@ def make_figure(body: Body, reflectivity: float | None) -> Figure:
     materials = tuple(solid.material for link in body.links for solid in link.solids)
     shares = [reflectivity or REFLECTIVITY[material] for material in materials]
     limbs = tuple(_limb(of_link) for of_link in meshes)
-    return Figure(body, limbs, measure_extent(body, meshes), materials, np.array(shares, np.float32))
+    extent = measure_extent(body, meshes)
+    reach = measure_reach(body, meshes, extent)
+    return Figure(body, limbs, extent, reach, materials, np.array(shares, np.float32))
 
 
 def _limb(meshes: list[Mesh]) -> Limb:

@@ -119,7 +119,7 @@ def _fit(body: MovingBody, starts: Float64Array, site: _Site) -> MovingBody:
     Raises:
         ScenarioError: It cannot.
     """
-    reach = body.measure_reach()
+    reach = body.figure.reach
     _refuse_contact(body, reach, site)
     return _start_clear(body, reach, starts, site)
 

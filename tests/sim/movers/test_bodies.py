@@ -146,7 +146,7 @@ def test_the_reach_of_a_mover_holds_every_moment_on_a_bend(kind: str, bend_per_m
     body = make_body(kind)
     way = body.course.distance_m / body.course.length_m
     bent = replace(body, course=replace(body.course, bend_per_m=bend_per_m * way))
-    extent, reach = body.figure.extent, bent.measure_reach()
+    extent, reach = body.figure.extent, bent.figure.reach
     moment = bent.course.moment(np.random.default_rng(3).uniform(0, 200, 400))
     boxes = list(zip(*reach.at(moment.bend_per_m), strict=True))
     for limb, poses in zip(bent.figure.limbs, bent.figure.body.place_links(moment), strict=True):
