@@ -25,7 +25,7 @@ from eval.running.results.run_data import RunData
 from eval.running.results.sides import find_other_worlds
 from eval.running.results.values import text
 from eval.tables.conditions import odometry_of
-from eval.tables.rows import PAIR, is_told_the_truth, numbers, stated, texts, tunnels_of
+from eval.tables.rows import PAIR, is_told_the_truth, numbers, stated, stated_columns, texts, tunnels_of
 
 FIGURES = ("region_recall", "false_regions_per_100m", "is_alarm", "object_iou_point", "object_f1_50", "t_total_s")
 HEADINGS = dict(zip(FIGURES, ("recall", "false/100m", "alarms", "IoU", "F1 at 0.5", "time [s]"), strict=True))
@@ -81,7 +81,7 @@ def compare_with_reference(results: pd.DataFrame, name: str, references: Sequenc
             {"part": part, "reference": variant, "n_pairs": len(each), **row,
              "verdict": NOT_JUDGED if is_time(row["metric"]) else verdict(row)}
             for variant, each in tables.items() if variant != name
-            for row in paired_differences(_stated(each), _stated(own.loc[each.index]))
+            for row in paired_differences(stated_columns(each, FIGURES), stated_columns(own.loc[each.index], FIGURES))
         ]  # fmt: skip
     pairs = pd.DataFrame(list(_by_pair(own, others, calls)))
     return Comparison(
@@ -200,10 +200,6 @@ def summarise_figures(name: str, rows: pd.DataFrame) -> dict[str, Any]:
         row[f"{key}_low"], row[f"{key}_high"] = interval_over_tunnels(values, tunnels, statistic)
         row[f"{key}_n"] = int(np.count_nonzero(~np.isnan(values)))
     return row
-
-
-def _stated(rows: pd.DataFrame) -> pd.DataFrame:
-    return pd.DataFrame({key: stated(rows, key) for key in FIGURES}, index=rows.index)
 
 
 def _by_pair(own: pd.DataFrame, others: Mapping[str, pd.DataFrame], calls: Pairs) -> Iterator[dict[str, Any]]:

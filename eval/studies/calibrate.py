@@ -159,12 +159,18 @@ def format_settings(table: pd.DataFrame) -> str:
 
 
 def format_plan(table: pd.DataFrame) -> str:
-    """Return the thresholds of variants with settings as a plan has them: at most 5 % of the unchanged pairs alarm."""
+    """Return the thresholds of variants with settings as a plan has them: at most 5 % of the unchanged pairs alarm.
+
+    A comment stands where no threshold keeps the rate.
+    """
     is_settings = table["variant"].str.contains("[", regex=False)
-    own = table[is_settings & table["score_radius_m"].isna() & table["threshold"].notna()]
-    if len(own) == 0:
+    own = table[is_settings & table["score_radius_m"].isna()]
+    if not own["threshold"].notna().any():
         return ""
-    lines = [f'  "{name}": {value:g}' for name, value in zip(own["variant"], own["threshold"], strict=True)]
+    lines = [
+        f"  # {name}: none, too many pairs alarm at every threshold" if np.isnan(value) else f'  "{name}": {value:g}'
+        for name, value in zip(own["variant"], own["threshold"] + 0.0, strict=True)  # 0 for -0
+    ]
     return "\n".join(["thresholds:  # of a plan", *lines, ""])
 
 

@@ -133,6 +133,11 @@ def stated(cases: pd.DataFrame, column: str) -> Float64Array:
     return np.full(len(values), np.nan) if is_cost and is_left_out.any() else values
 
 
+def stated_columns(cases: pd.DataFrame, columns: Iterable[str]) -> pd.DataFrame:
+    """Return columns of the rows of one method as `stated` does, with the index of the rows."""
+    return pd.DataFrame({column: stated(cases, column) for column in columns}, index=cases.index)
+
+
 def by_domain(results: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     """Yield the rows of each domain that is present, and all rows where both are.
 

@@ -19,7 +19,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files import require_plain_file
 
 _MCAP, _SQLITE = b"\x89MCAP", b"SQLite format 3"
-_METADATA, _ABOUT = "metadata.yaml", "rosbag2_bagfile_information"
+METADATA, _ABOUT = "metadata.yaml", "rosbag2_bagfile_information"
 # Version 9, since ROS 2 Jazzy, has the QoS of a topic as a list, which was a text: nothing here reads it.
 _KNOWN_VERSION = 8
 # Parts of `rosbag record --split`: run_0.bag or run_2024-05-31-12-30-59_0.bag, the next one without a pause.
@@ -38,14 +38,14 @@ def find_paths(path: Path, folder: Path) -> list[Path]:
         for each in path.iterdir():
             if not each.is_dir():
                 require_plain_file(each)
-        if (path / _METADATA).is_file():
+        if (path / METADATA).is_file():
             return [_renew_metadata(path, folder)]
         files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3", ".bag"))
         if len(files) > 1 and all(file.suffix == ".bag" for file in files):
             return _sort_parts(files)
         if len(files) != 1:
             ways = "write it by `ros2 bag reindex FOLDER`, or name one of them"
-            raise ValueError(f"{len(files)} files without a {_METADATA}: {ways}")
+            raise ValueError(f"{len(files)} files without a {METADATA}: {ways}")
         path = files[0]
     require_plain_file(path)
     with path.open("rb") as file:
@@ -119,7 +119,7 @@ def _read_metadata(path: Path) -> dict[str, Any]:
     """Return what metadata.yaml of a bag's folder says; nothing where it says nothing about a bag."""
     from ruamel.yaml import YAML
 
-    document = YAML(typ="safe").load((path / _METADATA).read_text(encoding="utf-8"))
+    document = YAML(typ="safe").load((path / METADATA).read_text(encoding="utf-8"))
     about = document.get(_ABOUT) if isinstance(document, dict) else None
     return about if isinstance(about, dict) else {}
 
@@ -129,7 +129,7 @@ def _list_files(path: Path, about: dict[str, Any]) -> list[str]:
     names = [Path(str(each)).name for each in about["relative_file_paths"]]
     missing = [name for name in names if not (path / name).is_file()]
     if missing or not names:
-        raise ValueError(f"{_METADATA} names {missing[:1] or 'no file'}, which is not in the folder: copy it again")
+        raise ValueError(f"{METADATA} names {missing[:1] or 'no file'}, which is not in the folder: copy it again")
     return names
 
 
@@ -156,7 +156,9 @@ def _make_folder(path: Path, folder: Path, *, is_mcap: bool) -> None:
 
 
 def _write_metadata(folder: Path, about: dict[str, Any]) -> None:
-    (folder / _METADATA).write_text(json.dumps({_ABOUT: about}), encoding="utf-8")  # JSON is YAML
+    # a link of this name would lead to a file of the user
+    with (folder / METADATA).open("x", encoding="utf-8") as file:
+        file.write(json.dumps({_ABOUT: about}))  # JSON is YAML
 
 
 class _Channel(NamedTuple):

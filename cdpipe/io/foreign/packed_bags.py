@@ -8,8 +8,8 @@ from pathlib import Path
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.isolated_reader import IsolatedReader
+from cdpipe.io.foreign.bag_layout import METADATA
 
-_METADATA = "metadata.yaml"
 # The scans are written to the same disk afterwards.
 _SHARE_OF_FREE_SPACE = 0.5
 
@@ -24,7 +24,7 @@ def unpack_bag(path: Path, reader: IsolatedReader) -> Path | None:
     Raises:
         InputError: The bag is damaged, or takes more than half of the free space when decompressed.
     """
-    if not (path / _METADATA).is_file() or all(each.suffix != ".zstd" for each in path.iterdir()):
+    if not (path / METADATA).is_file() or all(each.suffix != ".zstd" for each in path.iterdir()):
         return None
     above = Path(tempfile.mkdtemp(prefix="tunnelcd-bag-"))
     out = above / (path.resolve().name or "bag")
@@ -46,7 +46,7 @@ def _write_files(path: Path, out: Path, reader: IsolatedReader) -> bool:
     n_bytes = 0
     for about, arrays in reader.read("unpack", path=str(path)):
         if "metadata" in about:
-            (out / _METADATA).write_text(str(about["metadata"]), encoding="utf-8")
+            (out / METADATA).write_text(str(about["metadata"]), encoding="utf-8")
             continue
         n_bytes += arrays["block"].nbytes
         if n_bytes > most_bytes:

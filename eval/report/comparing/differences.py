@@ -24,7 +24,7 @@ from eval.running.results.sides import Side, check_extras, check_versions, match
 from eval.tables.columns import Column
 from eval.tables.conditions import Condition, by_condition
 from eval.tables.regions.curves import recall_at, recall_difference
-from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, numbers, stated, tunnels_of, with_pair
+from eval.tables.rows import ALL_DOMAINS, DOMAINS, PAIR, numbers, stated_columns, tunnels_of, with_pair
 
 BETTER, WORSE, NOISE = "better", "worse", "no difference beyond noise"
 SAME, TOO_FEW, NOT_JUDGED = "the same", "too few pairs", "not judged"
@@ -61,12 +61,13 @@ def compare(a: Side, b: Side, *, times_count: bool = True, seed: int = 0) -> pd.
     of_plan = _pairs_of_plan(a)
     unmade = [set(_pairs(side.results)) - set(_pairs(with_pair(side.results))) for side in (a, b)]
     figures = [figures_of(_without(side.results, unmade[0] & unmade[1])) for side in (a, b)]
+    compared = [column.key for column in COMPARED if all(column.key in frame for frame in figures)]
     rows: list[dict[str, Any]] = []
     for variants in matched_variants(a, b):
         own = [frame[frame["variant"] == name] for frame, name in zip(figures, variants, strict=True)]
         for scope, where, pairs in _groups(own[0], own[1], of_plan):
             names = {"scope": scope, "where": where, "variant_a": variants[0], "variant_b": variants[1]}
-            first, second = (_stated(frame.set_index(PAIR).loc[pairs]) for frame in own)
+            first, second = (stated_columns(frame.set_index(PAIR).loc[pairs], compared) for frame in own)
             found = paired_differences(first, second, seed)
             if scope == "domain":
                 found += pooled_difference((a, b), variants, pairs, seed)
@@ -91,12 +92,6 @@ def _pairs_of_plan(side: Side) -> pd.MultiIndex:
     """Return the pairs that the figures of a side's plan are of, by odometry and sensor (`by_condition`)."""
     _, is_its = by_condition(side.results, read_targets(side.data.provenance))[0]
     return _pairs(side.results[is_its])
-
-
-def _stated(figures: pd.DataFrame) -> pd.DataFrame:
-    """Return the figures of a method; of a cost that an answer leaves out NaN for all."""
-    costs = [column.key for column in COMPARED if column.key in figures]
-    return figures.assign(**{key: stated(figures, key) for key in costs})
 
 
 def _pairs(results: pd.DataFrame) -> pd.MultiIndex:

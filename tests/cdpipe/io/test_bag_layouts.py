@@ -76,6 +76,14 @@ def test_metadata_of_jazzy_lead_nowhere_else(tmp_path: Path) -> None:
     assert "metadata.yaml names ['..'], which is not in the folder: copy it again" in said(folder)
 
 
+def test_metadata_that_name_themselves_as_a_file_of_the_bag_are_not_written_over(tmp_path: Path) -> None:
+    folder = change_metadata(write_bag(tmp_path / "ros2", MADE), make_jazzy)
+    change_metadata(folder, lambda about: about.update(relative_file_paths=["metadata.yaml"]))
+    before = (folder / "metadata.yaml").read_bytes()
+    assert "not a readable bag" in said(folder)
+    assert (folder / "metadata.yaml").read_bytes() == before
+
+
 @pytest.mark.parametrize("is_jazzy", [False, True])
 def test_a_bag_with_compressed_files_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_jazzy: bool) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))

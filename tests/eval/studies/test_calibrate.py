@@ -71,6 +71,11 @@ def test_a_plan_that_names_no_wide_drifts_has_one_threshold_for_a_variant() -> N
     assert format_plan(table) == ""  # a preset holds its own threshold
     named = format_plan(table.assign(variant="c2c[extract.method=surface]", threshold=200.1))
     assert yaml.safe_load(named) == {"thresholds": {"c2c[extract.method=surface]": 200.1}}
+    both = pd.concat([table.assign(variant=f"c2c[a.b={value}]", threshold=value) for value in (-0.0, np.nan)])
+    assert format_plan(both).splitlines()[1:] == [
+        '  "c2c[a.b=-0.0]": 0',
+        "  # c2c[a.b=nan]: none, too many pairs alarm at every threshold",
+    ]
 
 
 def test_a_table_by_hand() -> None:
