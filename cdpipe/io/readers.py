@@ -139,6 +139,7 @@ class RecordedScans:
             signal=signal.ravel().take(hits) if signal.any() else None,
             second_from=range_mm.size // 2 if self.session.n_returns == 2 else None,
             intensity=self._chunk.reflectivity[row].ravel().take(hits).astype(np.float32),
+            pose_ns=int(self._chunk.column_stamps_ns[row, range_mm.shape[1] // 2]),
         )
 
     def scans(self) -> Iterator[PosedScan]:

@@ -44,6 +44,7 @@ class PosedScan:
         second_from: Pixels from this one on are second returns of the beams from pixel 0 on; None: one return a beam.
         intensity: (N,) float32 intensity of each return in the recording's own unit, None where it has none.
         airborne_sensor: (D, 3) returns that were left out as mist or dust; None where the air is clear.
+        pose_ns: Time of the pose, where the poses deskewed the points; else None.
     """
 
     index: int
@@ -55,6 +56,7 @@ class PosedScan:
     second_from: int | None = None
     intensity: Float32Array | None = None
     airborne_sensor: Float64Array | None = None
+    pose_ns: int | None = None
 
     def __post_init__(self) -> None:
         n = len(self.points_sensor)

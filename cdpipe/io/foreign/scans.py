@@ -119,12 +119,15 @@ class PosedClouds:
         kept = points[is_return]
         times = None if cloud.times is None else cloud.times[is_return]
         offset_s = point_times(times, float(self.stamps_s[index])) if self._deskew else None
+        pose_ns = None
         if offset_s is not None and self._motion is not None:
             kept = deskew_points(kept, offset_s, float(self.stamps_s[index]), self._motion)
             stamps_ns = stamps_ns + np.round(offset_s * 1e9).astype(np.int64)
+            pose_ns = int(self._stamps_ns[index])
         pixels = np.flatnonzero(is_return).astype(np.int32)
         shone = None if cloud.intensity is None else cloud.intensity[is_return]
-        scan = PosedScan(index, kept, self.odom_T_sensor[index], stamps_ns, pixels, intensity=shone)
+        pose = self.odom_T_sensor[index]
+        scan = PosedScan(index, kept, pose, stamps_ns, pixels, intensity=shone, pose_ns=pose_ns)
         return scan, len(points) - len(pixels)
 
 

@@ -5,7 +5,8 @@ apart, and metres where the odometry found no start. Here each scan is registere
 scans within a few metres of path. The relative pose of the odometry to its neighbours is the prior: it decides where
 the walls do not.
 
-1. From the middle of the session to both ends, each scan is registered with the scans before it (`_follow`).
+1. From the middle of the session to both ends, each scan is registered with the scans before it, and the odometry is
+   mended where it lost its way (`following.py`).
 2. Sweeps register every scan with those on both sides (`_sweep`): first each with every second scan alone, never
    with itself, as a scan that is off would find itself; then with all, which ties even and odd scans together.
 3. A scan that no pose lays on the walls is bent: the sensor was shaken within the revolution. Its points are left out.
@@ -15,6 +16,7 @@ the walls do not.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -23,16 +25,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from cdpipe.core.errors import InputWarning
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert
 from cdpipe.core.progress import Progress, report_nothing
+from cdpipe.mapping.poses.following import FOLLOWING, Mended, follow, mend_odometry
 from cdpipe.mapping.poses.loops import Loop, close_loops, find_loops
 from cdpipe.mapping.poses.scan_registration import Registration, Samples, Target, register_scan
 from cdpipe.model.types import PosedScan, ScanSource, WrappedScans
 
 # A block of path is registered with one map: its scans, and those within this way before and after it.
 _BLOCK_M, _AROUND_M = 4.0, 6.0
-# A scan is followed in the map of the scans within this way behind it, which is made anew once per metre.
-_BEHIND_M, _RENEWED_M = 10.0, 1.0
 # Scans agree already if a sweep by halves moves nine of ten by no more than this, turns included, at the distance of a
 # wall: 0.1 to 1.2 cm at constant drift or with true poses, 6 cm hand-held (validation tunnels).
 _AGREE_M, _WALL_M = 0.015, 3.0
@@ -42,20 +44,28 @@ _JUMP_M = 0.15
 # Least share of the recorded way, block by block, that a registration keeps. Five scans each of an OS0-8 on a driving
 # car, which lock onto their rings, keep 0.16 and 0.22.
 _LEAST_WAY = 0.8
+# Where the odometry lost more scans than this share, it is the registration that errs.
+_MOST_LOST = 0.5
 _ROUNDING = 1e-9  # of an interpolated percentile
 # A scan is bent if so many of its points are off the walls, and so many times as many as of the scans around it.
 _BENT_SHARE, _BENT_FACTOR = 0.05, 3.0
-_FOLLOWING = Registration(voxel_m=0.3, correspondence_m=1.0, robust_m=0.2, step_m=0.2, step_rad=0.02)
 _BY_HALVES = Registration(voxel_m=0.2, correspondence_m=0.5, robust_m=0.07, step_m=0.1, step_rad=0.01)
 _WITH_ALL = Registration(voxel_m=0.2, correspondence_m=0.5, robust_m=0.05, step_m=0.1, step_rad=0.01)
 
 
 class ConsistentScans(WrappedScans):
-    """A session with other poses than those that were recorded, and without the points of (S,) bent scans."""
+    """A session with other poses than those that were recorded, and without the points of (S,) bent scans.
 
-    def __init__(self, source: ScanSource, odom_T_sensor: Float64Array, is_bent: BoolArray) -> None:
+    Attributes:
+        path_T_sensor: (S, 4, 4) poses whose path spaces the keyframes: as recorded, if the odometry keeps its way.
+    """
+
+    def __init__(
+        self, source: ScanSource, odom_T_sensor: Float64Array, is_bent: BoolArray, mended: Mended | None = None
+    ) -> None:
         super().__init__(source)
-        self._poses, self._is_bent = odom_T_sensor, is_bent
+        self.path_T_sensor = source.odom_T_sensor if mended is None else odom_T_sensor
+        self._poses, self._is_bent, self._mended = odom_T_sensor, is_bent, mended
 
     @property
     def odom_T_sensor(self) -> Float64Array:
@@ -64,7 +74,7 @@ class ConsistentScans(WrappedScans):
 
     def over(self, source: ScanSource) -> ConsistentScans:
         """Return the scans of another source with these poses, and without the points of the same bent scans."""
-        return ConsistentScans(source, self._poses, self._is_bent)
+        return ConsistentScans(source, self._poses, self._is_bent, self._mended)
 
     def scan(self, index: int) -> PosedScan:
         """Read one scan."""
@@ -78,6 +88,8 @@ class ConsistentScans(WrappedScans):
     def _corrected(self, scan: PosedScan) -> PosedScan:
         if self._is_bent[scan.index]:
             scan = replace(scan.keep(slice(0)), airborne_sensor=None)
+        elif self._mended is not None:
+            scan = self._mended.deskewed(scan, self._poses)
         return replace(scan, odom_T_sensor=self._poses[scan.index])
 
 
@@ -100,11 +112,18 @@ def make_consistent(
     is_bent = np.zeros(len(recorded), dtype=np.bool_)
     if len(recorded) == 1:
         return ConsistentScans(source, recorded, is_bent)
+    mended: Mended | None = None
     scans, told = Samples(source), _Told(on_step, len(recorded))
-    poses, is_kept = scans.recorded, _agree(scans, scans.recorded, told)
+    poses, is_kept = scans.odometry, _agree(scans, scans.odometry, told)
     if not is_kept:
-        followed = _follow(scans, _FOLLOWING, told)
-        is_kept = _slides(scans, followed)
+        told.begin()
+        followed, is_lost = follow(scans, told.add)
+        is_kept = _slides(scans, followed, is_lost)
+        if is_kept:
+            scans.restore()
+        elif is_lost.any():
+            mended = mend_odometry(scans, followed, is_lost)
+            _warn_of_lost(source, is_lost)
     if not is_kept:
         poses, off_share = _sweep_all(scans, followed, _BY_HALVES, told, by_halves=True)
         is_bent = _find_bent(scans.path_m, off_share)
@@ -114,7 +133,15 @@ def make_consistent(
         poses, _ = _sweep_all(scans, close_loops(scans.path_m, poses, loops), _WITH_ALL, told, loops=loops)
     elif is_kept:
         poses = recorded
-    return ConsistentScans(source, poses, is_bent)
+    return ConsistentScans(source, poses, is_bent, mended)
+
+
+def _warn_of_lost(source: ScanSource, is_lost: BoolArray) -> None:
+    told = (
+        f"the odometry loses its way at scan {int(np.argmax(is_lost))} of {len(is_lost)}: the steps to "
+        f"{np.count_nonzero(is_lost)} scans that it lays beside the walls are found anew"
+    )
+    warnings.warn(f"{source.name}: {told}", InputWarning, stacklevel=2)
 
 
 def _agree(scans: Samples, poses: Float64Array, told: _Told) -> bool:
@@ -146,23 +173,27 @@ def _has_jump(scans: Samples, poses: Float64Array) -> bool:
         if not len(before):
             continue
         last = poses[end - 1]
-        target = Target(scans, poses, before, last[:3, 3], _FOLLOWING.voxel_m)
-        found, _ = register_scan(scans.of_scan(end - 1), last, [last], target, _FOLLOWING)
-        if _moved_m(last[None], found[None])[0] > _JUMP_M:
+        target = Target(scans, poses, before, last[:3, 3], FOLLOWING.voxel_m)
+        found = register_scan(scans.of_scan(end - 1), last, [last], target, FOLLOWING)
+        if _moved_m(last[None], found.pose[None])[0] > _JUMP_M:
             return True
     return False
 
 
-def _slides(scans: Samples, poses: Float64Array) -> bool:
+def _slides(scans: Samples, poses: Float64Array, is_lost: BoolArray) -> bool:
     """Return whether the (S, 4, 4) registered poses lost a part of the recorded way, as rings that match rings do.
 
     Few beams, or scans far apart, meet the ground in rings around the sensor. Where these hold a registration, the
-    sensor seems to stand.
+    sensor seems to stand. Blocks with scans that the odometry lost (S,) tell nothing; where it lost most of all, it is
+    the registration that errs.
     """
-    ends = np.append(np.unique(np.floor(scans.path_m / _BLOCK_M), return_index=True)[1], len(poses) - 1)
-    way_m, recorded_m = (np.linalg.norm(np.diff(each[ends, :3, 3], axis=0), axis=1) for each in (poses, scans.recorded))
-    is_driven = recorded_m > _BLOCK_M / 4  # the way of a sensor that stands is its jitter
-    return bool(way_m[is_driven].sum() < _LEAST_WAY * recorded_m[is_driven].sum())
+    starts = np.unique(np.floor(scans.path_m / _BLOCK_M), return_index=True)[1]
+    ends = np.append(starts, len(poses) - 1)
+    way_m, recorded_m = (np.linalg.norm(np.diff(each[ends, :3, 3], axis=0), axis=1) for each in (poses, scans.odometry))
+    # the way of a sensor that stands is its jitter
+    is_driven = (recorded_m > _BLOCK_M / 4) & ~np.logical_or.reduceat(is_lost, starts)
+    keeps_way = way_m[is_driven].sum() >= _LEAST_WAY * recorded_m[is_driven].sum()
+    return bool(not keeps_way or np.mean(is_lost) > _MOST_LOST)
 
 
 def _moved_m(poses: Float64Array, found: Float64Array) -> Float64Array:
@@ -193,26 +224,6 @@ def _find_bent(path_m: Float64Array, off_share: Float64Array) -> BoolArray:
     first, end = (np.searchsorted(path_m, stops_m + way_m) for way_m in (-_AROUND_M, _AROUND_M))
     usual = np.array([np.median(off_share[a:b]) for a, b in zip(first, np.maximum(end, first + 1), strict=True)])
     return np.asarray(off_share > np.maximum(_BENT_SHARE, _BENT_FACTOR * usual[stop]))
-
-
-def _follow(scans: Samples, settings: Registration, told: _Told) -> Float64Array:
-    """Return the (S, 4, 4) poses, each found from its neighbour's; the middle scan keeps its recorded pose."""
-    found, path_m = scans.recorded.copy(), scans.path_m
-    n, middle = len(found), len(found) // 2
-    told.begin()
-    for way in (range(middle + 1, n), range(middle - 1, -1, -1)):
-        target, made_m = None, np.inf
-        for index in way:
-            last = index - way.step
-            guess = found[last] @ invert(scans.recorded[last]) @ scans.recorded[index]
-            if target is None or abs(path_m[index] - made_m) >= _RENEWED_M:
-                behind = np.arange(middle, index, way.step)
-                near = behind[np.abs(path_m[behind] - path_m[index]) <= _BEHIND_M]
-                made_m = path_m[index]
-                target = Target(scans, found, near if len(near) else behind[-1:], guess[:3, 3], settings.voxel_m)
-            found[index], _ = register_scan(scans.of_scan(index), guess, [guess], target, settings)
-            told.add()
-    return found
 
 
 def _sweep_all(
@@ -248,7 +259,7 @@ def _sweep(
         (B,) scans of a block, their (B, 4, 4) poses, and the (B,) share of each scan's points that are off the walls.
     """
     told.begin()
-    steps = invert(scans.recorded[:-1]) @ scans.recorded[1:]
+    steps = invert(scans.odometry[:-1]) @ scans.odometry[1:]
     ends_m = scans.path_m[[each for loop in loops for each in ((loop.scan, loop.other), (loop.other, loop.scan))]]
     blocks = np.floor(scans.path_m / _BLOCK_M)
     for block in np.unique(blocks):
@@ -265,9 +276,8 @@ def _sweep(
             predicted = [poses[index - 1] @ steps[index - 1]] if index else []
             predicted += [poses[index + 1] @ invert(steps[index])] if index + 1 < len(poses) else []
             target = first if index % 2 == 0 else second
-            found[number], off_share[number] = register_scan(
-                scans.of_scan(index), poses[index], predicted, target, settings
-            )
+            at = register_scan(scans.of_scan(index), poses[index], predicted, target, settings)
+            found[number], off_share[number] = at.pose, at.off_share
             told.add()
         yield own, found, off_share
 

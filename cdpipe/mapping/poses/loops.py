@@ -156,7 +156,7 @@ class _Place:
         """Return the (4, 4) other_T_self from a start, and the share of points that lie on the other's surface."""
         pose = start
         for settings in registrations:
-            pose, _ = register_scan(self.points, pose, [pose], other.target, settings)
+            pose = register_scan(self.points, pose, [pose], other.target, settings).pose
         found, distances_m, _ = other.target.planes(transform(pose, self.points), _COUNTERPART_M)
         if len(found) < max(MIN_PAIRS, len(self.points) / 2):
             return pose, 0.0

@@ -14,13 +14,15 @@ from functools import partial
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import Float64Array, fit_rigid, invert, transform_each
+from cdpipe.core.geometry import BoolArray, Float64Array, fit_rigid, invert, transform_each
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, SurfaceField
 from cdpipe.model.types import PointMap
 
 # Both sessions were in one place where their paths come this near to one another, as evidence `overlap` has it.
 _SHARED_M = 5.0
+# Most by which odometry errs between two keyframes that has not lost its way: KISS-ICP by 0.7 m in a sharp turn.
+_LEAP_M = 1.5
 
 
 def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) -> ChangeReport:
@@ -29,8 +31,8 @@ def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) 
     The report is returned unchanged where both maps have these frames. An object moves as a whole, by the motion of its
     middle, and keeps its size and its upright axis. The alignment at an after keyframe takes what the sensor saw there
     to the place where it was found. The frames differ from place to place: `before_T_after` is the rigid transform that
-    best fits the alignment at the after keyframes beside the before path, at all of them if none is. It stays as it was
-    found where no pose was made another one.
+    best fits the alignment at the after keyframes beside the before path, at all of them if none is. Where an odometry
+    lost its way, it fits the longest stretch between. It stays as it was found where no pose was made another one.
 
     Args:
         report: In the frames of the maps.
@@ -52,6 +54,7 @@ def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) 
     if len(scans) and not (_is_as_recorded(before) and _is_as_recorded(after)):
         gaps_m = np.asarray(cKDTree(before.odom_T_keyframe[:, :3, 3]).query(map_T_keyframe[:, :3, 3])[0])
         shared = gaps_m <= _SHARED_M if gaps_m.min() <= _SHARED_M else np.ones(len(scans), dtype=np.bool_)
+        shared &= _longest_stretch(recorded_local, recorded_T_keyframe, shared)
         before_T_after = fit_rigid(recorded_T_keyframe[shared, :3, 3], recorded_local[shared])
     return replace(
         report,
@@ -61,6 +64,17 @@ def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) 
         local_before_T_after=recorded_local,
         surface=None if report.surface is None else _move_surface(report.surface, before),
     )
+
+
+def _longest_stretch(local: Float64Array, recorded_T_keyframe: Float64Array, shared: BoolArray) -> BoolArray:
+    """Return the (K,) after keyframes of the stretch with most shared ones in which no odometry lost its way.
+
+    There the (K, 4, 4) alignment leaps from one keyframe to the next, at the place of the (K, 4, 4) recorded pose.
+    """
+    places = recorded_T_keyframe[1:, :3, 3]
+    leaps_m = np.linalg.norm(transform_each(local[1:], places) - transform_each(local[:-1], places), axis=1)
+    stretch = np.concatenate([[0], np.cumsum(leaps_m > _LEAP_M)])
+    return np.asarray(stretch == np.argmax(np.bincount(stretch[shared])))
 
 
 def regions_as_mapped(regions: ChangeRegions, before: PointMap) -> ChangeRegions:

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import small_gicp
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.geometry import Float64Array, Int64Array, invert, make_pose, plane_jacobian, transform, travelled_m
+from cdpipe.core.geometry import (
+    Float64Array,
+    Int64Array,
+    invert,
+    make_pose,
+    plane_jacobian,
+    transform,
+    travelled_m,
+)
+from cdpipe.core.geometry.motion import Motion, make_motion
 from cdpipe.core.geometry.voxel import cell_keys
 from cdpipe.core.spooled import SpooledArray
 from cdpipe.model.types import ScanSource
@@ -52,25 +62,59 @@ class Registration:
     step_rad: float
 
 
+class Registered(NamedTuple):
+    """A scan that was registered.
+
+    Attributes:
+        pose: (4, 4) its pose, odom frame.
+        off_share: Share of the points with a counterpart that lie 0.1 m and more off the walls.
+        on_share: Share of all points that lie on the walls.
+    """
+
+    pose: Float64Array
+    off_share: float
+    on_share: float
+
+
 class Samples:
-    """Points of every scan, in its sensor frame, and the recorded path.
+    """Points of every scan, in its sensor frame, and the path of the odometry.
 
     Rotations that are exact only to float32 are made orthonormal: their inverses are taken, and errors would add up.
+
+    Attributes:
+        source: The session.
+        odometry: (S, 4, 4) recorded poses, or what they are mended to.
+        path_m: (S,) length of this path up to each scan.
+        motion: The recorded one; None where it deskewed no points.
     """
 
     def __init__(self, source: ScanSource) -> None:
-        self.recorded = _orthonormal(source.odom_T_sensor)
-        self.path_m = travelled_m(self.recorded)
+        self.source, self.odometry = source, orthonormal(source.odom_T_sensor)
+        self.path_m = travelled_m(self.odometry)
         of_map, of_scan = SpooledArray(np.float32, (3,)), SpooledArray(np.float32, (3,))
-        sizes = []
+        sizes, times_ns = [], []
         for scan in source.scans():
-            points = scan.points_sensor[np.einsum("ij,ij->i", scan.points_sensor, scan.points_sensor) < _REACH_M**2]
-            parts = [_first_per_cell(points, cell_m) for cell_m in (_MAP_CELL_M, _SCAN_CELL_M)]
+            parts = sample_points(scan.points_sensor)
             for part, spooled in zip(parts, (of_map, of_scan), strict=True):
                 spooled.append(part)
             sizes.append([len(part) for part in parts])
+            times_ns.append(-1 if scan.pose_ns is None else scan.pose_ns)
         self._points = of_map.finish(), of_scan.finish()
         self._offsets = np.concatenate([np.zeros((1, 2), np.int64), np.cumsum(sizes, axis=0)])
+        self.motion = _motion(self.odometry, times_ns)
+        self._replaced: dict[int, list[Float64Array]] = {}
+
+    def mend(self, odometry: Float64Array) -> None:
+        """Take other (S, 4, 4) poses for those of the odometry."""
+        self.odometry, self.path_m = odometry, travelled_m(odometry)
+
+    def restore(self) -> None:
+        """Take the points of all scans as they are recorded."""
+        self._replaced.clear()
+
+    def replace(self, index: int, points: Float64Array) -> None:
+        """Take other (N, 3) points of a scan, sensor frame."""
+        self._replaced[index] = sample_points(points)
 
     def of_map(self, index: int) -> Float64Array:
         """Return the (N, 3) points that a scan adds to a map."""
@@ -81,11 +125,26 @@ class Samples:
         return self._part(1, index)
 
     def _part(self, kind: int, index: int) -> Float64Array:
+        if index in self._replaced:
+            return self._replaced[index][kind]
         start, end = self._offsets[index : index + 2, kind]
         return self._points[kind][start:end].astype(np.float64)
 
 
-def _orthonormal(poses: Float64Array) -> Float64Array:
+def _motion(poses: Float64Array, times_ns: list[int]) -> Motion | None:
+    """Return the motion through (S, 4, 4) poses, or None where a time is unknown (-1) or not after the one before."""
+    time_s = np.array(times_ns) / 1e9
+    if len(poses) < 2 or min(times_ns) < 0 or (np.diff(time_s) <= 0).any():
+        return None
+    return motion_through(time_s, poses)
+
+
+def motion_through(time_s: Float64Array, poses: Float64Array) -> Motion:
+    """Return the motion through (S, 4, 4) poses at (S,) times."""
+    return make_motion(time_s, travelled_m(poses), poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]))
+
+
+def orthonormal(poses: Float64Array) -> Float64Array:
     """Return the (S, 4, 4) poses with orthonormal rotations; those that are so to the rounding of float64 stay."""
     rotations = poses[:, :3, :3]
     defects = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
@@ -100,6 +159,12 @@ def spread(scans: Int64Array) -> Int64Array:
     """Return (N,) scans, or 200 of them from the first to the last."""
     n = len(scans)
     return scans if n <= _MOST_SCANS else scans[np.linspace(0, n - 1, _MOST_SCANS).astype(np.int64)]
+
+
+def sample_points(points: Float64Array) -> list[Float64Array]:
+    """Return of (N, 3) points of a scan those that it adds to a map, and those that are registered."""
+    points = points[np.einsum("ij,ij->i", points, points) < _REACH_M**2]
+    return [_first_per_cell(points, cell_m) for cell_m in (_MAP_CELL_M, _SCAN_CELL_M)]
 
 
 def _first_per_cell(points: Float64Array, cell_m: float) -> Float64Array:
@@ -149,14 +214,14 @@ def register_scan(
     predicted: Sequence[Float64Array],
     target: Target,
     settings: Registration,
-) -> tuple[Float64Array, float]:
-    """Return the (4, 4) pose of a scan, and the share of its points that it leaves 0.1 m and more off the walls.
+) -> Registered:
+    """Return the pose of a scan, and how it lies on the walls.
 
     It is found by Gauss-Newton on the distances to planes and on the odometry.
 
     Args:
         points: (N, 3) points, sensor frame, metres.
-        guess: (4, 4) first pose, odom frame; it is the answer, with a share of 0, where too few points have a
+        guess: (4, 4) first pose, odom frame; it is the answer, with shares of 0, where too few points have a
             counterpart.
         predicted: (4, 4) poses that the odometry predicts from neighbours, one at least.
         target: The map.
@@ -168,7 +233,7 @@ def register_scan(
     for _ in range(_STEPS):
         chosen, distances_m, normals = target.planes(transform(pose, points), settings.correspondence_m)
         if len(chosen) < MIN_PAIRS:
-            return guess, 0.0
+            return Registered(guess, 0.0, 0.0)
         jacobian = plane_jacobian(points.take(chosen, axis=0), normals @ pose[:3, :3])
         weighted = jacobian / (_POINT_M * (1 + (distances_m / settings.robust_m) ** 2))[:, None] ** 2
         told = _discount_normal_noise(weighted.T @ jacobian)
@@ -185,7 +250,8 @@ def register_scan(
         pose = pose @ make_pose(Rotation.from_rotvec(step[:3]).as_matrix(), step[3:])
         if np.abs(step).max() < _CONVERGED:
             break
-    return invert(shift) @ pose, float(np.mean(np.abs(distances_m) > _OFF_WALLS_M))
+    n_off = int(np.count_nonzero(np.abs(distances_m) > _OFF_WALLS_M))
+    return Registered(invert(shift) @ pose, n_off / len(chosen), (len(chosen) - n_off) / len(points))
 
 
 def _discount_normal_noise(hessian: Float64Array) -> Float64Array:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,9 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.geometry import Float64Array, invert, make_pose, transform, yaw_pose
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import ScanChunk, SessionWriter
-from cdpipe.mapping.deskew import deskew
+from cdpipe.mapping.deskew import deskew, deskew_anew
+from cdpipe.mapping.poses.scan_registration import motion_through
+from cdpipe.model.types import PosedScan
 from cdpipe.sensor.ouster import SensorMetadata, load_profile
 
 ROOM_M = np.array([6.0, 4.0, 2.5])  # half extents
@@ -93,3 +96,21 @@ def test_deskewing_commutes_with_a_rigid_motion_of_the_revolution() -> None:
 def test_the_number_of_column_poses_must_fit() -> None:
     with pytest.raises(ValueError, match=r"column_poses must be \(3, 7\), got \(2, 7\)"):
         deskew(np.zeros((4, 3, 3)), np.zeros((2, 7)))
+
+
+def test_a_scan_is_deskewed_anew_by_another_motion(sensor: SensorMetadata) -> None:
+    ranges, _, world_T_sensor = revolution(sensor, 0)
+    time_s = np.arange(0, 0.1001, 0.0005)
+    true = motion_through(time_s, np.array([pose_at(10 * each) for each in time_s]))
+    wrong = motion_through(np.array([0.0, 0.1]), np.array([pose_at(0), yaw_pose(-1.0, (0.3, 0.2, 0.0))]))
+    column_s = np.arange(sensor.width) / sensor.width * 0.1
+    sensor_T_column = invert(wrong.poses(np.array([0.05]))) @ wrong.poses(column_s)
+    quaternions = Rotation.from_matrix(sensor_T_column[:, :3, :3]).as_quat()
+    points = deskew(sensor.project(ranges), np.column_stack([sensor_T_column[:, :3, 3], quaternions])).reshape(-1, 3)
+    stamps_ns = np.tile(np.round(column_s * 1e9).astype(np.int64), sensor.height)
+    pixels = np.arange(len(points), dtype=np.int32)
+    scan = PosedScan(0, points, np.eye(4), stamps_ns, pixels, pose_ns=50_000_000)
+    assert np.median(wall_distance_m(transform(world_T_sensor, points))) > 0.1
+    anew = deskew_anew(scan, wrong, true)
+    assert wall_distance_m(transform(world_T_sensor, anew.points_sensor)).max() < 1e-3
+    assert deskew_anew(replace(scan, pose_ns=None), wrong, true).points_sensor is points

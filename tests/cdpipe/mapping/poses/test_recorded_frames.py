@@ -197,3 +197,19 @@ def test_the_rigid_merge_fits_where_both_sessions_were(
     )
     told = report_as_recorded(replace(report, local_before_T_after=None), before, after)
     np.testing.assert_allclose(told.before_T_after, report.before_T_after, atol=1e-6)
+
+
+@pytest.mark.parametrize("is_before", [True, False])
+def test_the_rigid_merge_fits_where_the_odometry_kept_its_way(
+    report: ChangeReport, tunnel_before: MappedSession, tunnel_after: MappedSession, is_before: bool
+) -> None:
+    session = tunnel_before if is_before else tunnel_after
+    recorded = session.map.odom_T_sensor.copy()
+    n_lost = len(recorded) // 3
+    for number in range(n_lost):  # steps of 3 m to another side each
+        recorded[len(recorded) - n_lost + number, :3, 3] += np.array([0.0, 3.0, 1.0]) * (number + 1)
+    lost = replace(session.map, recorded_T_sensor=recorded)
+    before, after = (lost, tunnel_after.map) if is_before else (tunnel_before.map, lost)
+    told = report_as_recorded(report, before, after)
+    off = invert(report.before_T_after) @ told.before_T_after
+    assert np.linalg.norm(off[:3, 3]) < 0.3
