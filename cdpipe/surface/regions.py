@@ -89,4 +89,5 @@ def _smooth(
 def _describe(points: Float64Array, areas_m2: Float64Array, along_m: Float64Array) -> SurfaceRegion:
     area_m2, volume_m3 = float(areas_m2.sum()), float(areas_m2 @ along_m)
     centre = areas_m2 @ points / area_m2
-    return SurfaceRegion(centre, area_m2, volume_m3, volume_m3 / area_m2, float(along_m[np.argmax(np.abs(along_m))]))
+    mean_m = float(np.clip(volume_m3 / area_m2, along_m.min(), along_m.max()))  # rounding goes beyond equal ones
+    return SurfaceRegion(centre, area_m2, volume_m3, mean_m, float(along_m[np.argmax(np.abs(along_m))]))

@@ -37,6 +37,8 @@ FOLLOWING = Registration(voxel_m=0.3, correspondence_m=1.0, robust_m=0.2, step_m
 _OFF_SHARE, _GAIN = 0.1, 0.1
 _SEEKING = Registration(voxel_m=0.3, correspondence_m=2.0, robust_m=0.5, step_m=0.5, step_rad=0.5)
 _HEADINGS = 18
+# So many scans more are looked for in vain than are found: a scan takes a second, and some recordings agree nowhere.
+_IN_VAIN = 10
 
 
 def follow(scans: Samples, on_scan: Callable[[], None]) -> tuple[Float64Array, BoolArray]:
@@ -51,6 +53,7 @@ def follow(scans: Samples, on_scan: Callable[[], None]) -> tuple[Float64Array, B
     found, path_m = scans.odometry.copy(), scans.path_m
     n, middle = len(found), len(found) // 2
     is_lost = np.zeros(n, dtype=np.bool_)
+    n_sought = 0
     for way in (range(middle + 1, n), range(middle - 1, -1, -1)):
         target, made_m = None, np.inf
         for index in way:
@@ -62,7 +65,9 @@ def follow(scans: Samples, on_scan: Callable[[], None]) -> tuple[Float64Array, B
                 made_m = path_m[index]
                 target = Target(scans, found, near if len(near) else behind[-1:], guess[:3, 3], FOLLOWING.voxel_m)
             at = register_scan(scans.of_scan(index), guess, [guess], target, FOLLOWING)
-            if at.off_share > _OFF_SHARE or at.on_share == 0:
+            is_off = at.off_share > _OFF_SHARE or at.on_share == 0
+            if is_off and n_sought < 2 * np.count_nonzero(is_lost) + _IN_VAIN:
+                n_sought += 1
                 again = _find_again(scans, found, last, index, target)
                 if again.on_share > at.on_share + _GAIN:
                     at, is_lost[index] = again, True

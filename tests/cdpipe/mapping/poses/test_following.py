@@ -13,7 +13,7 @@ from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.poses import consistency
 from cdpipe.mapping.poses.consistency import make_consistent
 from cdpipe.mapping.poses.following import follow
-from cdpipe.mapping.poses.scan_registration import Samples, motion_through
+from cdpipe.mapping.poses.scan_registration import Registered, Samples, motion_through
 from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PosedScan
 from tests.cdpipe.conftest import CloudScans, scanned
@@ -138,3 +138,19 @@ def test_times_that_do_not_rise_make_no_motion(tunnel: CloudScans) -> None:
         timed = Timed("timed", tunnel.odom_T_sensor[:3], [tunnel.scan(index).points_sensor for index in range(3)])
         timed.times_ns = times_ns
         assert isinstance(Samples(timed).motion, Motion) == is_motion
+
+
+def test_scans_that_agree_nowhere_are_not_looked_for_to_the_end(
+    tunnel: CloudScans, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(0)
+    clouds = [rng.uniform(-5, 5, (2000, 3)) for _ in range(N_SCANS)]
+    n_sought: list[int] = []
+
+    def find_nothing(*_: object) -> Registered:
+        n_sought.append(1)
+        return Registered(np.eye(4), 0.0, 0.0)
+
+    monkeypatch.setattr("cdpipe.mapping.poses.following._find_again", find_nothing)
+    _, is_lost = follow(Samples(CloudScans("noise", tunnel.odom_T_sensor, clouds)), lambda: None)
+    assert len(n_sought) == 10 and not is_lost.any()
