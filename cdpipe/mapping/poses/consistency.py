@@ -137,11 +137,10 @@ def make_consistent(
 
 
 def _warn_of_lost(source: ScanSource, is_lost: BoolArray) -> None:
-    told = (
-        f"the odometry loses its way at scan {int(np.argmax(is_lost))} of {len(is_lost)}: the steps to "
-        f"{np.count_nonzero(is_lost)} scans that it lays beside the walls are found anew"
-    )
-    warnings.warn(f"{source.name}: {told}", InputWarning, stacklevel=2)
+    n, first = np.count_nonzero(is_lost), int(np.argmax(is_lost))
+    scans = "one scan" if n == 1 else f"{n} scans"
+    told = f"loses its way at scan {first} of {len(is_lost)}: {scans} beside the walls, found anew from neighbours"
+    warnings.warn(f"{source.name}: the odometry {told}", InputWarning, stacklevel=2)
 
 
 def _agree(scans: Samples, poses: Float64Array, told: _Told) -> bool:
