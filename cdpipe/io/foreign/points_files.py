@@ -223,7 +223,8 @@ def _reads(path: str, what: str) -> Iterator[None]:
     except ImportError as error:
         raise InputError(f"{path}: {what} needs a package more: pip install 'tunnelcd[formats]'") from error
     except BaseException as error:  # a panic of Rust is no Exception
-        if not isinstance(error, _ERRORS) and type(error).__module__.split(".")[0] not in _LIBRARY_MODULES:
+        is_told = isinstance(error, _ERRORS) or type(error) is Exception  # pye57 raises the base class itself
+        if not is_told and type(error).__module__.split(".")[0] not in _LIBRARY_MODULES:
             raise
         told = " ".join(str(error).split()) or type(error).__name__
         raise InputError(

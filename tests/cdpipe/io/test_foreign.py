@@ -104,6 +104,20 @@ def test_semantic_kitti(tmp_path: Path) -> None:
         assert "000002.bin: 30 bytes: expected x, y, z, intensity" in said(folder)
 
 
+def test_an_e57_without_a_coordinate_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pye57 = pytest.importorskip("pye57")
+    file = write_e57(tmp_path / "scans.e57", STANDING)
+
+    def lack_z(*_: object, **__: object) -> None:
+        raise Exception("unsupported point field ['cartesianX', 'cartesianY']")
+
+    monkeypatch.setattr(pye57.E57, "read_scan", lack_z)
+    with pytest.raises(
+        InputError, match=r"scans.e57: not a readable E57 file: .*cartesianY.*: copy or export it again"
+    ):
+        list(read_e57(str(file), 0))
+
+
 def test_e57_has_the_poses_of_its_scanner(tmp_path: Path) -> None:
     pytest.importorskip("pye57")
     assert worst_m(write_e57(tmp_path / "a.e57", STANDING)) < 1e-4
