@@ -57,11 +57,10 @@ def build_map(
     """
     _require_reachable(source, config)
     recorded_T_sensor = None if config.consistency == "none" else source.odom_T_sensor
-    cleared, consistent, path_T_sensor = source, None, source.odom_T_sensor
+    keyframe_scans = choose_keyframes(source.odom_T_sensor, config.keyframe_spacing_m)
+    cleared, consistent = source, None
     if config.consistency != "none":
         source = consistent = make_consistent(source, has_loops=config.consistency == "graph", on_step=on_step)
-        path_T_sensor = consistent.path_T_sensor
-    keyframe_scans = choose_keyframes(path_T_sensor, config.keyframe_spacing_m)
     point_map = _accumulate(source, keyframe_scans, config, batch_scans)
     if isinstance(cleared, ClearScans) and cleared.has_dropped:
         supported = cleared.supported_by(point_map)

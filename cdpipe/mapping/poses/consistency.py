@@ -54,17 +54,12 @@ _WITH_ALL = Registration(voxel_m=0.2, correspondence_m=0.5, robust_m=0.05, step_
 
 
 class ConsistentScans(WrappedScans):
-    """A session with other poses than those that were recorded, and without the points of (S,) bent scans.
-
-    Attributes:
-        path_T_sensor: (S, 4, 4) poses whose path spaces the keyframes: as recorded, if the odometry keeps its way.
-    """
+    """A session with other poses than those that were recorded, and without the points of (S,) bent scans."""
 
     def __init__(
         self, source: ScanSource, odom_T_sensor: Float64Array, is_bent: BoolArray, mended: Mended | None = None
     ) -> None:
         super().__init__(source)
-        self.path_T_sensor = source.odom_T_sensor if mended is None else odom_T_sensor
         self._poses, self._is_bent, self._mended = odom_T_sensor, is_bent, mended
 
     @property

@@ -69,7 +69,8 @@ def follow(scans: Samples, on_scan: Callable[[], None]) -> tuple[Float64Array, B
             if is_off and n_sought < 2 * np.count_nonzero(is_lost) + _IN_VAIN:
                 n_sought += 1
                 again = _find_again(scans, found, last, index, target)
-                if again.on_share > at.on_share + _GAIN:
+                is_better = at.on_share == 0 or again.off_share < at.off_share / 2  # loose points lie off anywhere
+                if is_better and again.on_share > at.on_share + _GAIN:
                     at, is_lost[index] = again, True
                     scans.replace(index, _deskew(scans, scans.source.scan(index), found[last], last, at.pose))
             found[index] = at.pose

@@ -9,12 +9,10 @@ from cdpipe.core.errors import InputWarning
 from cdpipe.core.geometry import BoolArray, Float64Array, invert, make_pose, yaw_pose
 from cdpipe.core.geometry.motion import Motion
 from cdpipe.mapping.deskew import deskew_anew
-from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.poses import consistency
 from cdpipe.mapping.poses.consistency import make_consistent
 from cdpipe.mapping.poses.following import follow
 from cdpipe.mapping.poses.scan_registration import Registered, Samples, motion_through
-from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PosedScan
 from tests.cdpipe.conftest import CloudScans, scanned
 
@@ -69,7 +67,6 @@ def test_an_odometry_that_spins_to_an_end_is_found_again(tunnel: CloudScans, at:
     with pytest.warns(InputWarning, match=rf"loses its way at scan {at if at > 20 else 0} of 40: 1[23] scans beside"):
         consistent = make_consistent(source)
     assert steps_off_m(consistent.odom_T_sensor, true).max() < 0.06
-    np.testing.assert_array_equal(consistent.path_T_sensor, consistent.odom_T_sensor)
 
 
 def test_its_scans_are_deskewed_anew(tunnel: CloudScans) -> None:
@@ -89,18 +86,6 @@ def test_its_scans_are_deskewed_anew(tunnel: CloudScans) -> None:
     np.testing.assert_array_equal(scans[34].points_sensor, consistent.over(source).scan(34).points_sensor)
     # the others stay as they are recorded
     np.testing.assert_array_equal(scans[5].points_sensor, source.scan(5).points_sensor)
-
-
-def test_keyframes_are_spaced_by_the_way_that_was_found(tunnel: CloudScans) -> None:
-    true = tunnel.odom_T_sensor
-    stuck = true.copy()
-    stuck[LOST_AT:] = true[LOST_AT - 1]  # the odometry finds nothing and stands, turned about
-    stuck[LOST_AT:, :3, :3] = true[LOST_AT - 1, :3, :3] @ yaw_pose(np.deg2rad(80.0), (0, 0, 0))[:3, :3]
-    with pytest.warns(InputWarning, match="loses its way"):
-        point_map = build_map(with_poses(tunnel, stuck), MapConfig(consistency="scan-to-map"))
-    assert abs(len(point_map.keyframe_scans) - len(choose_keyframes(true, 1.0))) <= 1
-    assert point_map.recorded_T_sensor is not None
-    np.testing.assert_array_equal(point_map.recorded_T_sensor, stuck)
 
 
 def test_scans_that_lie_on_the_walls_are_not_looked_for(tunnel: CloudScans, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,7 +108,6 @@ def test_where_most_scans_are_lost_the_recorded_poses_stay(tunnel: CloudScans, m
     monkeypatch.setattr(consistency, "follow", lose_most)
     consistent = make_consistent(noisy)
     np.testing.assert_array_equal(consistent.odom_T_sensor, noisy.odom_T_sensor)
-    np.testing.assert_array_equal(consistent.path_T_sensor, noisy.odom_T_sensor)
 
 
 def test_times_that_do_not_rise_make_no_motion(tunnel: CloudScans) -> None:
