@@ -10,18 +10,16 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.geometry import Float64Array, Int64Array, invert
 from cdpipe.core.geometry.motion import Motion
 from cdpipe.io.foreign.clouds import SWEEP_S, Cloud, Clouds, point_times
+from cdpipe.mapping.deskew import deskew_points
 from cdpipe.model.types import PosedScan
 
 # Largest change of a pose entry, metres or radians, that odometry reports for a sensor at rest.
 _STANDING = 0.1
-# Points are deskewed in steps of this time: 0.3 mm at 3 m/s.
-_STEP_S = 1e-4
 _NO_SWEEP = f"they span no sweep, {SWEEP_S[0]} to {SWEEP_S[1]} s"
 
 
@@ -156,25 +154,6 @@ class Repeats:
             raise InputError(
                 f"{where} repeats {other}: the same returns to the last bit, recorded twice: remove one and its pose"
             )
-
-
-def deskew_points(points: Float64Array, offset_s: Float64Array, stamp_s: float, motion: Motion) -> Float64Array:
-    """Return points (N, 3), each in the sensor frame at its own time, in the sensor frame at the stamp of the scan.
-
-    Args:
-        points: (N, 3) points, metres.
-        offset_s: (N,) time of each after the stamp.
-        stamp_s: The stamp, of the clock of the motion.
-        motion: `odom_T_sensor` over time.
-    """
-    steps, which = np.unique(np.round(offset_s / _STEP_S).astype(np.int64), return_inverse=True)
-    places, quaternions = motion.sample(stamp_s + steps.astype(np.float64) * _STEP_S)
-    (at,), (turn,) = motion.sample(np.array([stamp_s]))
-    sensor_R_odom = Rotation.from_quat(turn).inv()
-    matrices = (sensor_R_odom * Rotation.from_quat(quaternions)).as_matrix()
-    shifts = sensor_R_odom.apply(places - at)
-    turned: Float64Array = np.einsum("nij,nj->ni", matrices[which], points)
-    return turned + shifts[which]
 
 
 def in_sensor_frames(clouds_odom: Clouds, odom_T_sensor: Float64Array) -> Clouds:

@@ -23,29 +23,26 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputWarning
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert
 from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.mapping.poses.following import FOLLOWING, Mended, follow, mend_odometry
 from cdpipe.mapping.poses.loops import Loop, close_loops, find_loops
-from cdpipe.mapping.poses.scan_registration import Registration, Samples, Target, register_scan
+from cdpipe.mapping.poses.scan_registration import Registration, Samples, Target, moved_m, register_scan
 from cdpipe.model.types import PosedScan, ScanSource, WrappedScans
 
 # A block of path is registered with one map: its scans, and those within this way before and after it.
 _BLOCK_M, _AROUND_M = 4.0, 6.0
 # Scans agree already if a sweep by halves moves nine of ten by no more than this, turns included, at the distance of a
 # wall: 0.1 to 1.2 cm at constant drift or with true poses, 6 cm hand-held (validation tunnels).
-_AGREE_M, _WALL_M = 0.015, 3.0
+_AGREE_M = 0.015
 # There is a jump before a scan that moves by more when it is registered with the scans before it. The most of a session
 # is 1 to 6 cm at constant drift or with true poses, 9 cm in mist or among movers (the same tunnels).
 _JUMP_M = 0.15
 # Least share of the recorded way, block by block, that a registration keeps. Five scans each of an OS0-8 on a driving
 # car, which lock onto their rings, keep 0.16 and 0.22.
 _LEAST_WAY = 0.8
-# Where the odometry lost more scans than this share, it is the registration that errs.
-_MOST_LOST = 0.5
 _ROUNDING = 1e-9  # of an interpolated percentile
 # A scan is bent if so many of its points are off the walls, and so many times as many as of the scans around it.
 _BENT_SHARE, _BENT_FACTOR = 0.05, 3.0
@@ -112,13 +109,13 @@ def make_consistent(
     poses, is_kept = scans.odometry, _agree(scans, scans.odometry, told)
     if not is_kept:
         told.begin()
-        followed, is_lost = follow(scans, told.add)
-        is_kept = _slides(scans, followed, is_lost)
+        followed, is_wrong = follow(scans, told.add)
+        is_kept = _slides(scans, followed, is_wrong)
         if is_kept:
             scans.restore()
-        elif is_lost.any():
-            mended = mend_odometry(scans, followed, is_lost)
-            _warn_of_lost(source, is_lost)
+        elif is_wrong.any():
+            mended = mend_odometry(scans, followed, is_wrong)
+            _warn_of_lost(source, is_wrong)
     if not is_kept:
         poses, off_share = _sweep_all(scans, followed, _BY_HALVES, told, by_halves=True)
         is_bent = _find_bent(scans.path_m, off_share)
@@ -131,11 +128,11 @@ def make_consistent(
     return ConsistentScans(source, poses, is_bent, mended)
 
 
-def _warn_of_lost(source: ScanSource, is_lost: BoolArray) -> None:
-    n, first = np.count_nonzero(is_lost), int(np.argmax(is_lost))
-    scans = "one scan" if n == 1 else f"{n} scans"
-    told = f"loses its way at scan {first} of {len(is_lost)}: {scans} beside the walls, found anew from neighbours"
-    warnings.warn(f"{source.name}: the odometry {told}", InputWarning, stacklevel=2)
+def _warn_of_lost(source: ScanSource, is_wrong: BoolArray) -> None:
+    n, first = np.count_nonzero(is_wrong), int(np.argmax(is_wrong))
+    steps = f"{n} of {len(is_wrong)} steps, first" if n > 1 else "the step"
+    told = f"{steps} from scan {first} to {first + 1}, beside the walls, found anew"
+    warnings.warn(f"{source.name}: the odometry loses its way: {told}", InputWarning, stacklevel=2)
 
 
 def _agree(scans: Samples, poses: Float64Array, told: _Told) -> bool:
@@ -143,16 +140,16 @@ def _agree(scans: Samples, poses: Float64Array, told: _Told) -> bool:
 
     The sweep ends as soon as its answer is certain.
     """
-    n, moved_m = len(poses), np.zeros(len(poses))
+    n, shifts_m = len(poses), np.zeros(len(poses))
     below = int(0.9 * (n - 1))  # the 90th percentile lies between this one of the sorted values and the next
     n_near = n_far = 0
     for own, found, _ in _sweep(scans, poses, _WITH_ALL, told, by_halves=True):
-        moved_m[own] = _moved_m(poses[own], found)
-        n_near += int(np.count_nonzero(moved_m[own] < _AGREE_M * (1 - _ROUNDING)))
-        n_far += int(np.count_nonzero(moved_m[own] > _AGREE_M * (1 + _ROUNDING)))
+        shifts_m[own] = moved_m(poses[own], found)
+        n_near += int(np.count_nonzero(shifts_m[own] < _AGREE_M * (1 - _ROUNDING)))
+        n_far += int(np.count_nonzero(shifts_m[own] > _AGREE_M * (1 + _ROUNDING)))
         if n_near >= below + 2 or n_far >= n - below:
             break
-    return not np.percentile(moved_m, 90) > _AGREE_M and not _has_jump(scans, poses)
+    return not np.percentile(shifts_m, 90) > _AGREE_M and not _has_jump(scans, poses)
 
 
 def _has_jump(scans: Samples, poses: Float64Array) -> bool:
@@ -169,32 +166,22 @@ def _has_jump(scans: Samples, poses: Float64Array) -> bool:
         last = poses[end - 1]
         target = Target(scans, poses, before, last[:3, 3], FOLLOWING.voxel_m)
         found = register_scan(scans.of_scan(end - 1), last, [last], target, FOLLOWING)
-        if _moved_m(last[None], found.pose[None])[0] > _JUMP_M:
+        if moved_m(last[None], found.pose[None])[0] > _JUMP_M:
             return True
     return False
 
 
-def _slides(scans: Samples, poses: Float64Array, is_lost: BoolArray) -> bool:
+def _slides(scans: Samples, poses: Float64Array, is_wrong: BoolArray) -> bool:
     """Return whether the (S, 4, 4) registered poses lost a part of the recorded way, as rings that match rings do.
 
     Few beams, or scans far apart, meet the ground in rings around the sensor. Where these hold a registration, the
-    sensor seems to stand. Blocks with scans that the odometry lost (S,) tell nothing; where it lost most of all, it is
-    the registration that errs.
+    sensor seems to stand. Blocks with wrong steps of the odometry (S - 1,) tell nothing.
     """
-    starts = np.unique(np.floor(scans.path_m / _BLOCK_M), return_index=True)[1]
-    ends = np.append(starts, len(poses) - 1)
+    ends = np.append(np.unique(np.floor(scans.path_m / _BLOCK_M), return_index=True)[1], len(poses) - 1)
     way_m, recorded_m = (np.linalg.norm(np.diff(each[ends, :3, 3], axis=0), axis=1) for each in (poses, scans.odometry))
-    # the way of a sensor that stands is its jitter
-    is_driven = (recorded_m > _BLOCK_M / 4) & ~np.logical_or.reduceat(is_lost, starts)
-    keeps_way = way_m[is_driven].sum() >= _LEAST_WAY * recorded_m[is_driven].sum()
-    return bool(not keeps_way or np.mean(is_lost) > _MOST_LOST)
-
-
-def _moved_m(poses: Float64Array, found: Float64Array) -> Float64Array:
-    """Return the (N,) shifts from (N, 4, 4) poses to others, or what turns move at a wall where that is more."""
-    motions = invert(poses) @ found
-    turns_rad = Rotation.from_matrix(motions[:, :3, :3]).magnitude()
-    return np.asarray(np.maximum(np.linalg.norm(motions[:, :3, 3], axis=1), _WALL_M * turns_rad))
+    n_wrong = np.diff(np.append(0, np.cumsum(is_wrong))[ends])
+    is_driven = (recorded_m > _BLOCK_M / 4) & (n_wrong == 0)  # the way of a sensor that stands is its jitter
+    return bool(way_m[is_driven].sum() < _LEAST_WAY * recorded_m[is_driven].sum())
 
 
 class _Told:

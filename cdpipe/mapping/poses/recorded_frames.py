@@ -14,7 +14,8 @@ from functools import partial
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import BoolArray, Float64Array, fit_rigid, invert, transform_each
+from cdpipe.core.geometry import Float64Array, Int64Array, fit_rigid, invert, transform_each
+from cdpipe.mapping.poses.scan_registration import moved_m
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, SurfaceField
 from cdpipe.model.types import PointMap
@@ -22,7 +23,7 @@ from cdpipe.model.types import PointMap
 # Both sessions were in one place where their paths come this near to one another, as evidence `overlap` has it.
 _SHARED_M = 5.0
 # Most by which odometry errs between two keyframes that has not lost its way: KISS-ICP by 0.7 m in a sharp turn.
-_LEAP_M = 1.5
+_LEAP_M = 1.0
 
 
 def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) -> ChangeReport:
@@ -52,9 +53,12 @@ def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) 
     recorded_local = recorded @ map_T_keyframe @ invert(recorded_T_keyframe)
     before_T_after = report.before_T_after
     if len(scans) and not (_is_as_recorded(before) and _is_as_recorded(after)):
-        gaps_m = np.asarray(cKDTree(before.odom_T_keyframe[:, :3, 3]).query(map_T_keyframe[:, :3, 3])[0])
+        gaps_m, nearest = map(np.asarray, cKDTree(before.odom_T_keyframe[:, :3, 3]).query(map_T_keyframe[:, :3, 3]))
         shared = gaps_m <= _SHARED_M if gaps_m.min() <= _SHARED_M else np.ones(len(scans), dtype=np.bool_)
-        shared &= _longest_stretch(recorded_local, recorded_T_keyframe, shared)
+        of_before = _stretches(_recorded_T_keyframe(before), before.odom_T_keyframe)
+        both = np.column_stack([of_before[nearest], _stretches(recorded_T_keyframe, odom_T_keyframe)])
+        _, stretch, n_shared = np.unique(both[shared], axis=0, return_inverse=True, return_counts=True)
+        shared[shared] = stretch.ravel() == np.argmax(n_shared)
         before_T_after = fit_rigid(recorded_T_keyframe[shared, :3, 3], recorded_local[shared])
     return replace(
         report,
@@ -66,15 +70,10 @@ def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) 
     )
 
 
-def _longest_stretch(local: Float64Array, recorded_T_keyframe: Float64Array, shared: BoolArray) -> BoolArray:
-    """Return the (K,) after keyframes of the stretch with most shared ones in which no odometry lost its way.
-
-    There the (K, 4, 4) alignment leaps from one keyframe to the next, at the place of the (K, 4, 4) recorded pose.
-    """
-    places = recorded_T_keyframe[1:, :3, 3]
-    leaps_m = np.linalg.norm(transform_each(local[1:], places) - transform_each(local[:-1], places), axis=1)
-    stretch = np.concatenate([[0], np.cumsum(leaps_m > _LEAP_M)])
-    return np.asarray(stretch == np.argmax(np.bincount(stretch[shared])))
+def _stretches(recorded_T_keyframe: Float64Array, odom_T_keyframe: Float64Array) -> Int64Array:
+    """Return which stretch each of (K,) keyframes is in; one ends where the recorded odometry lost its way."""
+    recorded, mapped = (invert(each[:-1]) @ each[1:] for each in (recorded_T_keyframe, odom_T_keyframe))
+    return np.append(0, np.cumsum(moved_m(recorded, mapped) > _LEAP_M))
 
 
 def regions_as_mapped(regions: ChangeRegions, before: PointMap) -> ChangeRegions:

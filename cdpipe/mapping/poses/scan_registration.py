@@ -11,6 +11,7 @@ import small_gicp
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.geometry import (
+    Float32Array,
     Float64Array,
     Int64Array,
     invert,
@@ -39,6 +40,7 @@ _STEPS, _CONVERGED = 4, 2e-4
 _NOISE_SHARE = 0.006
 MIN_PAIRS = 50
 _ROUNDING = 1e-12  # of a rotation in float64
+_WALL_M = 3.0  # usual distance of a wall
 # A point at this distance from the planes of a map is not on its walls.
 _OFF_WALLS_M = 0.1
 
@@ -75,6 +77,11 @@ class Registered(NamedTuple):
     off_share: float
     on_share: float
 
+    @property
+    def misfit(self) -> float:
+        """The share of points off the walls; 1 where too few have a counterpart, or none lies on them."""
+        return self.off_share if self.on_share > 0 else 1.0
+
 
 class Samples:
     """Points of every scan, in its sensor frame, and the path of the odometry.
@@ -85,7 +92,7 @@ class Samples:
         source: The session.
         odometry: (S, 4, 4) recorded poses, or what they are mended to.
         path_m: (S,) length of this path up to each scan.
-        motion: The recorded one; None where it deskewed no points.
+        motion: That through the recorded poses; None where it deskewed no points.
     """
 
     def __init__(self, source: ScanSource) -> None:
@@ -94,7 +101,7 @@ class Samples:
         of_map, of_scan = SpooledArray(np.float32, (3,)), SpooledArray(np.float32, (3,))
         sizes, times_ns = [], []
         for scan in source.scans():
-            parts = sample_points(scan.points_sensor)
+            parts = [scan.points_sensor.take(rows, axis=0) for rows in sample_rows(scan.points_sensor)]
             for part, spooled in zip(parts, (of_map, of_scan), strict=True):
                 spooled.append(part)
             sizes.append([len(part) for part in parts])
@@ -102,7 +109,7 @@ class Samples:
         self._points = of_map.finish(), of_scan.finish()
         self._offsets = np.concatenate([np.zeros((1, 2), np.int64), np.cumsum(sizes, axis=0)])
         self.motion = _motion(self.odometry, times_ns)
-        self._replaced: dict[int, list[Float64Array]] = {}
+        self._replaced: dict[int, list[Float32Array]] = {}
 
     def mend(self, odometry: Float64Array) -> None:
         """Take other (S, 4, 4) poses for those of the odometry."""
@@ -114,7 +121,7 @@ class Samples:
 
     def replace(self, index: int, points: Float64Array) -> None:
         """Take other (N, 3) points of a scan, sensor frame."""
-        self._replaced[index] = sample_points(points)
+        self._replaced[index] = [points.take(rows, axis=0).astype(np.float32) for rows in sample_rows(points)]
 
     def of_map(self, index: int) -> Float64Array:
         """Return the (N, 3) points that a scan adds to a map."""
@@ -126,7 +133,7 @@ class Samples:
 
     def _part(self, kind: int, index: int) -> Float64Array:
         if index in self._replaced:
-            return self._replaced[index][kind]
+            return self._replaced[index][kind].astype(np.float64)
         start, end = self._offsets[index : index + 2, kind]
         return self._points[kind][start:end].astype(np.float64)
 
@@ -142,6 +149,13 @@ def _motion(poses: Float64Array, times_ns: list[int]) -> Motion | None:
 def motion_through(time_s: Float64Array, poses: Float64Array) -> Motion:
     """Return the motion through (S, 4, 4) poses at (S,) times."""
     return make_motion(time_s, travelled_m(poses), poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]))
+
+
+def moved_m(poses: Float64Array, found: Float64Array) -> Float64Array:
+    """Return the (N,) shifts from (N, 4, 4) poses to others, or what turns move at a wall where that is more."""
+    motions = invert(poses) @ found
+    turns_rad = Rotation.from_matrix(motions[:, :3, :3]).magnitude()
+    return np.asarray(np.maximum(np.linalg.norm(motions[:, :3, 3], axis=1), _WALL_M * turns_rad))
 
 
 def orthonormal(poses: Float64Array) -> Float64Array:
@@ -161,18 +175,18 @@ def spread(scans: Int64Array) -> Int64Array:
     return scans if n <= _MOST_SCANS else scans[np.linspace(0, n - 1, _MOST_SCANS).astype(np.int64)]
 
 
-def sample_points(points: Float64Array) -> list[Float64Array]:
-    """Return of (N, 3) points of a scan those that it adds to a map, and those that are registered."""
-    points = points[np.einsum("ij,ij->i", points, points) < _REACH_M**2]
-    return [_first_per_cell(points, cell_m) for cell_m in (_MAP_CELL_M, _SCAN_CELL_M)]
+def sample_rows(points: Float64Array) -> list[Int64Array]:
+    """Return of (N, 3) points of a scan the rows of those that it adds to a map, and of those that are registered."""
+    near = np.flatnonzero(np.einsum("ij,ij->i", points, points) < _REACH_M**2)
+    return [near[_first_per_cell(points.take(near, axis=0), cell_m)] for cell_m in (_MAP_CELL_M, _SCAN_CELL_M)]
 
 
-def _first_per_cell(points: Float64Array, cell_m: float) -> Float64Array:
+def _first_per_cell(points: Float64Array, cell_m: float) -> Int64Array:
     keys = cell_keys(points, cell_m)
     # neighbours in a scan mostly share a cell, so sorting one key per run is faster
     starts = np.flatnonzero(np.append(True, keys[1:] != keys[:-1])[: len(keys)])
     _, first = np.unique(keys[starts], return_index=True)
-    return points.take(starts[np.sort(first)], axis=0)
+    return np.asarray(starts[np.sort(first)])
 
 
 class Target:

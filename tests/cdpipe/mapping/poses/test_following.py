@@ -1,18 +1,19 @@
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from cdpipe.core.errors import InputWarning
-from cdpipe.core.geometry import BoolArray, Float64Array, invert, make_pose, yaw_pose
+from cdpipe.core.geometry import Float64Array, invert, make_pose, transform_each, yaw_pose
 from cdpipe.core.geometry.motion import Motion
-from cdpipe.mapping.deskew import deskew_anew
-from cdpipe.mapping.poses import consistency
+from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.poses.consistency import make_consistent
 from cdpipe.mapping.poses.following import follow
 from cdpipe.mapping.poses.scan_registration import Registered, Samples, motion_through
+from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PosedScan
 from tests.cdpipe.conftest import CloudScans, scanned
 
@@ -32,8 +33,12 @@ class SweptScans(CloudScans):
         scan = super().scan(index)
         turn = np.arctan2(scan.points_sensor[:, 1], scan.points_sensor[:, 0]) / (2 * np.pi)
         pose_ns = round(SCAN_S * (index + 1) * 1e9)
-        true = replace(scan, stamps_ns=pose_ns + np.round(turn * 0.2e9).astype(np.int64), pose_ns=pose_ns)
-        return deskew_anew(true, self._true, self._recorded)
+        stamps_ns = pose_ns + np.round(turn * 0.2e9).astype(np.int64)
+        at_s, then_s = np.array([pose_ns / 1e9]), stamps_ns / 1e9
+        then_T_sensor = invert(self._true.poses(then_s)) @ self._true.poses(at_s)
+        deskewed_T_then = invert(self._recorded.poses(at_s)) @ self._recorded.poses(then_s)
+        points = transform_each(deskewed_T_then @ then_T_sensor, scan.points_sensor)
+        return replace(scan, points_sensor=points, stamps_ns=stamps_ns, pose_ns=pose_ns, airborne_sensor=points[:1])
 
 
 @pytest.fixture(scope="module")
@@ -47,10 +52,10 @@ def with_poses(source: CloudScans, poses: Float64Array) -> CloudScans:
 
 
 def lost(true: Float64Array, at: int) -> Float64Array:
-    """The poses of an odometry that spins from a scan on: to the end, or back to the start."""
-    poses, is_late = true.copy(), at > len(true) // 2
-    for index in range(at, len(true)) if is_late else range(at, -1, -1):
-        poses[index] = poses[index - 1] @ SPIN if is_late else poses[index + 1] @ invert(SPIN)
+    """The poses of an odometry that spins from a scan on to the end."""
+    poses = true.copy()
+    for index in range(at, len(true)):
+        poses[index] = poses[index - 1] @ SPIN
     return poses
 
 
@@ -59,19 +64,60 @@ def steps_off_m(poses: Float64Array, true: Float64Array) -> Float64Array:
     return np.asarray(np.linalg.norm(errors[:, :3, 3], axis=1))
 
 
-@pytest.mark.parametrize("at", [LOST_AT, 12])
-def test_an_odometry_that_spins_to_an_end_is_found_again(tunnel: CloudScans, at: int) -> None:
+@pytest.mark.parametrize("at", [8, 16, 20, 28])  # before the middle, at it, and behind it
+def test_an_odometry_that_spins_to_the_end_is_found_again(tunnel: CloudScans, at: int) -> None:
     true = tunnel.odom_T_sensor
     source = with_poses(tunnel, lost(true, at))
-    assert np.count_nonzero(steps_off_m(source.odom_T_sensor, true) > 1.0) >= N_SCANS - LOST_AT
-    with pytest.warns(InputWarning, match=rf"loses its way at scan {at if at > 20 else 0} of 40: 1[23] scans beside"):
+    assert np.count_nonzero(steps_off_m(source.odom_T_sensor, true) > 1.0) >= N_SCANS - at
+    told = f"loses its way: {N_SCANS - at} of 39 steps, first from scan {at - 1} to {at}, beside the walls, found anew"
+    with pytest.warns(InputWarning, match=told):
         consistent = make_consistent(source)
     assert steps_off_m(consistent.odom_T_sensor, true).max() < 0.06
 
 
-def test_its_scans_are_deskewed_anew(tunnel: CloudScans) -> None:
+@pytest.mark.parametrize("jump_m", [3.0, 4.0])
+def test_one_wrong_step_is_no_way_that_the_registration_lost(tunnel: CloudScans, jump_m: float) -> None:
+    true = tunnel.odom_T_sensor
+    jumped = true.copy()
+    jumped[24:] = jumped[23] @ make_pose(translation=(jump_m, 0.0, 0.0)) @ invert(true[23]) @ true[24:]
+    with pytest.warns(InputWarning, match="its way: the step from scan 23 to 24, beside the walls, found anew"):
+        consistent = make_consistent(with_poses(tunnel, jumped))
+    assert steps_off_m(consistent.odom_T_sensor, true).max() < 0.06
+
+
+@pytest.mark.parametrize(("spacing_m", "loose"), [(2.5, 0.2), (3.0, 0.15), (3.0, 0.3)])
+def test_loose_points_make_no_scan_lost(spacing_m: float, loose: float) -> None:
+    """In a smooth drift with posts more points of a scan overlap with those of a scan nearby, wrong as the place is."""
+    rng = np.random.default_rng(0)
+    angle, along = rng.uniform(0, 2 * np.pi, 200_000), rng.uniform(-15, 85, 200_000)
+    wall = np.column_stack([along, 2.5 * np.cos(angle), 2.5 * np.sin(angle)])
+    posts = [
+        np.column_stack([x + 0.15 * np.cos(turn), side + 0.15 * np.sin(turn), rng.uniform(-2, 2, 300)])
+        for x, side in zip(rng.uniform(-10, 80, 40), rng.choice([-2.0, 2.0], 40), strict=True)
+        for turn in [rng.uniform(0, 2 * np.pi, 300)]
+    ]
+    rock = np.concatenate([wall, *posts])
+    true = make_pose(
+        translation=np.column_stack([np.arange(0, 68, spacing_m), *np.zeros((2, len(np.arange(0, 68, spacing_m))))])
+    )
+    clouds = []
+    for pose in true:
+        seen = rock[np.abs(rock[:, 0] - pose[0, 3]) < 12.0] - pose[:3, 3]
+        seen = seen[rng.random(len(seen)) < 0.25] + rng.normal(0, 0.01, 3)
+        is_loose = rng.random(len(seen)) < loose
+        seen[is_loose] *= rng.uniform(0.3, 0.95, (np.count_nonzero(is_loose), 1))
+        clouds.append(seen)
+    recorded = true @ make_pose(translation=rng.uniform(-0.1, 0.1, (len(true), 3)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # nothing is told of the odometry
+        consistent = make_consistent(CloudScans("loose", recorded, clouds))
+    assert steps_off_m(consistent.odom_T_sensor, true).max() < 0.3
+
+
+@pytest.mark.parametrize("at", [12, 28])
+def test_its_scans_are_deskewed_anew(tunnel: CloudScans, at: int) -> None:
     true, clouds = tunnel.odom_T_sensor, [tunnel.scan(index).points_sensor for index in range(N_SCANS)]
-    source = SweptScans(lost(true, LOST_AT), true, clouds)
+    source = SweptScans(lost(true, at), true, clouds)
 
     def off_m(scan: PosedScan) -> float:
         return float(np.percentile(np.linalg.norm(scan.points_sensor - clouds[scan.index], axis=1), 90))
@@ -79,13 +125,51 @@ def test_its_scans_are_deskewed_anew(tunnel: CloudScans) -> None:
     assert off_m(source.scan(34)) > 0.5
     with pytest.warns(InputWarning, match="loses its way"):
         consistent = make_consistent(source)
-    assert steps_off_m(consistent.odom_T_sensor, true).max() < 0.06
+    assert steps_off_m(consistent.odom_T_sensor, true).max() < 0.15
     scans = list(consistent.scans())
-    assert max(map(off_m, scans)) < 0.05
-    np.testing.assert_array_equal(scans[34].points_sensor, consistent.scan(34).points_sensor)
-    np.testing.assert_array_equal(scans[34].points_sensor, consistent.over(source).scan(34).points_sensor)
+    bent = [
+        scan.index for scan in scans if not len(scan.points_sensor)
+    ]  # beside the scan that the others are found from
+    assert len(bent) <= 2
+    assert max(off_m(scan) for scan in scans if scan.index not in bent) < 0.1
+    assert scans[34].airborne_sensor is None and scans[5].airborne_sensor is not None
+    for again in (consistent.scan(34), consistent.over(source).scan(34)):
+        np.testing.assert_array_equal(scans[34].points_sensor, again.points_sensor)
     # the others stay as they are recorded
     np.testing.assert_array_equal(scans[5].points_sensor, source.scan(5).points_sensor)
+
+
+def test_keyframes_stay_those_of_the_recorded_path(tunnel: CloudScans) -> None:
+    """Whoever reads an answer has the recorded poses, and tells by the keyframes whether it is one to the session."""
+    source = with_poses(tunnel, lost(tunnel.odom_T_sensor, LOST_AT))
+    with pytest.warns(InputWarning, match="loses its way"):
+        point_map = build_map(source, MapConfig(consistency="scan-to-map"))
+    np.testing.assert_array_equal(point_map.keyframe_scans, choose_keyframes(source.odom_T_sensor, 1.0))
+    assert point_map.recorded_T_sensor is not None
+    np.testing.assert_array_equal(point_map.recorded_T_sensor, source.odom_T_sensor)
+
+
+def test_scans_with_loose_points_do_not_keep_a_lost_one_from_being_found(tunnel: CloudScans) -> None:
+    rng, clouds = np.random.default_rng(1), [tunnel.scan(index).points_sensor.copy() for index in range(N_SCANS)]
+    for cloud in clouds[21:33]:
+        is_loose = rng.random(len(cloud)) < 0.5
+        cloud[is_loose] *= rng.uniform(0.5, 0.9, (np.count_nonzero(is_loose), 1))
+    _, is_wrong = follow(Samples(CloudScans("loose", lost(tunnel.odom_T_sensor, 34), clouds)), lambda: None)
+    assert np.flatnonzero(is_wrong).tolist() == [33, 34, 35, 36, 37, 38]
+
+
+def test_headings_are_tried_where_no_guess_meets_a_wall(tunnel: CloudScans, monkeypatch: pytest.MonkeyPatch) -> None:
+    n_registered: list[int] = []
+
+    def meet_nothing(points: Float64Array, guess: Float64Array, *_: object) -> Registered:
+        n_registered.append(len(points))
+        return Registered(guess, 0.0, 0.0)
+
+    scans = Samples(with_poses(tunnel, tunnel.odom_T_sensor[:3]))
+    monkeypatch.setattr("cdpipe.mapping.poses.following.register_scan", meet_nothing)
+    follow(scans, lambda: None)
+    # 7 scans to start from; two scans, each followed once, then sought with two settings
+    assert len(n_registered) == 7 + 2 * (1 + 2 * (3 + 17))
 
 
 def test_scans_that_lie_on_the_walls_are_not_looked_for(tunnel: CloudScans, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,21 +177,8 @@ def test_scans_that_lie_on_the_walls_are_not_looked_for(tunnel: CloudScans, monk
     scans = Samples(with_poses(tunnel, tunnel.odom_T_sensor @ off))
     n_told: list[int] = []
     monkeypatch.setattr("cdpipe.mapping.poses.following._find_again", None)
-    _, is_lost = follow(scans, lambda: n_told.append(1))
-    assert not is_lost.any() and len(n_told) == N_SCANS - 1
-
-
-def test_where_most_scans_are_lost_the_recorded_poses_stay(tunnel: CloudScans, monkeypatch: pytest.MonkeyPatch) -> None:
-    noisy = with_poses(tunnel, lost(tunnel.odom_T_sensor, LOST_AT))
-    shrunk = noisy.odom_T_sensor * 1.0
-
-    def lose_most(scans: Samples, _: object) -> tuple[Float64Array, BoolArray]:
-        scans.replace(3, np.zeros((1, 3)))
-        return shrunk, np.arange(N_SCANS) < 0.6 * N_SCANS
-
-    monkeypatch.setattr(consistency, "follow", lose_most)
-    consistent = make_consistent(noisy)
-    np.testing.assert_array_equal(consistent.odom_T_sensor, noisy.odom_T_sensor)
+    _, is_wrong = follow(scans, lambda: n_told.append(1))
+    assert not is_wrong.any() and len(n_told) == N_SCANS - 1
 
 
 def test_times_that_do_not_rise_make_no_motion(tunnel: CloudScans) -> None:
@@ -136,5 +207,5 @@ def test_scans_that_agree_nowhere_are_not_looked_for_to_the_end(
         return Registered(np.eye(4), 0.0, 0.0)
 
     monkeypatch.setattr("cdpipe.mapping.poses.following._find_again", find_nothing)
-    _, is_lost = follow(Samples(CloudScans("noise", tunnel.odom_T_sensor, clouds)), lambda: None)
-    assert len(n_sought) == 10 and not is_lost.any()
+    _, is_wrong = follow(Samples(CloudScans("noise", tunnel.odom_T_sensor, clouds)), lambda: None)
+    assert 0 < len(n_sought) < 10 and not is_wrong.any()
