@@ -14,6 +14,11 @@ _SPLITS = {
 }
 _MERGES = {"given": "merge as given", "tunnelcd": "merge as `tunnelcd` found it", "one recording": "one frame"}
 
+_NOTHING = (
+    "nothing is grafted: a real pair without changes",
+    "nothing is grafted: taken as unchanged: what did change between the recordings will count as a false alarm",
+)
+
 
 def tell_pair(truth: PairTruth) -> list[str]:
     """Return lines about a grafted pair: where it is from, what is in it, and how noisy the recording is."""
@@ -22,7 +27,7 @@ def tell_pair(truth: PairTruth) -> list[str]:
     lines += [_tell_rock(rock, each) for rock, each in zip(truth.surface_changes, graft.get("rock", ()), strict=True)]
     observable = sum(change.is_observable for change in truth.changes)
     if not graft["props"]:
-        return lines if graft.get("rock") else [*lines, "nothing is grafted: a real pair without changes"]
+        return lines if graft.get("rock") else [*lines, _NOTHING[len(graft["recordings"]) > 1]]
     replaced, grafted, lost = (sum(each[key] for each in graft["returns"]) for key in ("replaced", "grafted", "lost"))
     changes = "1 change" if len(truth.changes) == 1 else f"{len(truth.changes)} changes"
     lines.append(f"{changes}, {observable} observable; {grafted} returns of props, {lost} lost")

@@ -119,11 +119,15 @@ def _formats_in(folder: Path) -> dict[str, int]:
 
 
 def _guess_folder(folder: Path) -> str:
+    if (folder / "answer.json").is_file():  # its objects.ply is no scan
+        raise InputError(f"{folder}: an answer of `detect`, no session: name the two sessions, then the answer")
     found = _formats_in(folder)
     if len(found) > 1:
         told = ", ".join(f"{count} {name}" for name, count in found.items())
         raise InputError(f"{folder}: scans of several formats ({told}): name one, --format {' or '.join(found)}")
     if not found:
+        if (folder / "before").is_dir() and (folder / "after").is_dir():
+            raise InputError(f"{folder}: a pair, no session: name {folder / 'before'} and {folder / 'after'}")
         raise InputError(
             f"{folder}: no scans in it{_tell_content(folder)}: expected session.json (a session of ours), or *.ply, "
             "*.pcd, *.las, *.laz or *.bin scans with a trajectory, or *.e57 scans, or a bag"

@@ -255,6 +255,18 @@ def test_scans_that_cannot_be_deskewed_are_told(tmp_path: Path) -> None:
         list(open_session(folder).scans())
 
 
+def test_a_pair_and_an_answer_are_told_from_a_session(tmp_path: Path) -> None:
+    for name in ("before", "after"):
+        (tmp_path / "pair" / name).mkdir(parents=True)
+    assert said(tmp_path / "pair").endswith(f"no session: name {tmp_path}/pair/before and {tmp_path}/pair/after")
+    (tmp_path / "answer").mkdir()
+    for name in ("answer.json", "objects.csv", "objects.ply", "regions.csv"):
+        (tmp_path / "answer" / name).write_text("")
+    assert said(tmp_path / "answer").endswith(
+        "an answer of `detect`, no session: name the two sessions, then the answer"
+    )
+
+
 def test_a_folder_without_scans_tells_what_it_holds(tmp_path: Path) -> None:
     assert "no scans in it (it is empty): expected" in said(tmp_path)
     for name in ("a.json", "b.json", "README"):
