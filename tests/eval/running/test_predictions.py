@@ -345,7 +345,7 @@ def test_returns_where_nothing_returned_are_refused(
     assert ("nothing returned at any of their 14 (scan, pixel)" in err) == (code == 2)
 
 
-def test_an_answer_to_the_sessions_the_other_way_round_is_named(
+def test_an_answer_to_another_pair_is_named(
     tiny_pair: Path, command: Command, good: tuple[dict[str, Any], dict[str, Any]]
 ) -> None:
     document, arrays = good
@@ -359,15 +359,13 @@ def test_an_answer_to_the_sessions_the_other_way_round_is_named(
         "object_point_offsets": np.array([0, 200]),
     }
     document["objects"] = [{"session": "before", "kind": "removed"}]
-    for shift_m, expected in ((0.0, 0), (1.0, 0), (-1000.0, 2), (40.0, 2)):
+    for shift_m, expected in ((0.0, 0), (0.2, 0), (-1000.0, 2), (40.0, 2)):
         folder = tiny_pair.parent / f"theirs-{shift_m:g}"
         write_prediction(folder, document, {**whole, "object_points_map": own + shift_m})
         code, _, err = command("score", tiny_pair, folder)
         assert code == expected, err
-    extents_m = own.max(axis=0) - own.min(axis=0)
-    gap_m = np.linalg.norm(np.maximum(40.0 - extents_m, 0.0))
     assert err.count("\n") == 1 and "or to the sessions the other way round?" in err
-    assert f"objects[0]: object_points_map is {gap_m:.0f} m off the returns" in err
+    assert "1 of 1 objects do not lie where object_returns says: objects[0] is " in err
 
 
 @pytest.mark.parametrize("other", ["my_method", "MY method"])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import FARTHEST_M, make_pose
-from cdpipe.model.report import ChangedObject, ChangeRegions, ObjectShape
+from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, ObjectShape
 from eval.scoring import answer_check as module
 from eval.scoring.answer_check import MAX_AMOUNT, MAX_SECONDS, SECONDS
 from eval.truth.ground_truth import SessionTruth
@@ -264,38 +264,62 @@ def test_returns_of_another_type() -> None:
         module._check_returns("after", (twice,), SessionTruth(poses_once, poses_once, many))
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
+def report_of(objects: list[ChangedObject], local: np.ndarray | None = None, n_named: int = 0) -> ChangeReport:
+    none = np.zeros(0)
+    regions = ChangeRegions(np.zeros((0, 3)), 1.0, none, np.zeros((0, 2), np.int64), np.zeros(0, np.bool_), none)
+    scans = np.zeros(0, np.int64), np.arange(n_named)
+    shift = make_pose(translation=(0.0, 40.0, 0.0))  # before_T_after
+    return ChangeReport(shift, {}, regions, tuple(objects), {}, {}, scans, local_before_T_after=local)
+
+
+def placed(session: str, shift_m: np.ndarray | float) -> ChangedObject:
+    """Rows 5 to 14 of a line: a metre along x in the session's own frame, its points moved."""
+    rows = np.arange(5, 15)
+    own = line_points([0] * 20).points_odom[rows].astype(np.float64)
+    return item(session, [(0, pixel) for pixel in rows], own + shift_m)
+
+
+AFTER_M = np.array([0.0, 40.0, 0.0])
+PAIR = {"before": session_of(20, 3), "after": session_of(20, 3)}
+
+
+@pytest.mark.parametrize("axis", [1, 2])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize(("aside_m", "is_refused"), [(1.99, False), (2.01, True)])
-def test_points_beside_their_returns(axis: int, sign: float, aside_m: float, is_refused: bool) -> None:
-    scoring_points = line_points([0] * 20)
-    rows = np.arange(5, 15)
-    own = scoring_points.points_odom[rows].astype(np.float64)
-    beside = own.copy()
-    beside[:, axis] += sign * (aside_m + np.ptp(own[:, axis]))
-    returns = [(0, pixel) for pixel in rows]
-    with taken_or_refused(r"objects\[0\]: object_points_map is 2 m off" if is_refused else None):
-        module._check_places((item("before", returns, beside),), scoring_points)
-    # the after session's odom frame is not the map's, and an object without points or returns says nothing
-    module._check_places((item("after", returns, beside),), scoring_points)
-    module._check_places((item("before", returns, np.zeros((0, 3))), item("before", (), beside)), scoring_points)
+@pytest.mark.parametrize(("aside_m", "told"), [(0.49, None), (0.51, r"1 of 1 objects .*: objects\[0\] is 0\.5 m")])
+def test_points_beside_their_returns(axis: int, sign: float, aside_m: float, told: str | None) -> None:
+    shift_m = sign * aside_m * np.eye(3)[axis]
+    for session, known_m in (("before", 0.0), ("after", AFTER_M)):
+        with taken_or_refused(None if told is None else f"{told} from its returns in the {session} session"):
+            module._check_places(report_of([placed(session, known_m + shift_m)]), PAIR)
 
 
-def test_points_exactly_two_metres_beside_their_returns_are_near() -> None:
-    zeros = np.zeros(1, dtype=np.int16)
-    origin = ScoringPoints(np.arange(1), np.zeros((1, 3), np.float32), zeros, zeros, 1, 1)
-    module._check_places((item("before", [(0, 0)], np.array([(0.0, -2.0, 0.0)])),), origin)
-    with pytest.raises(ValueError, match="is 2 m off"):
-        module._check_places((item("before", [(0, 0)], np.array([(0.0, -2.0 - 1e-9, 0.0)])),), origin)
+def test_a_fifth_of_the_returns_beside_their_points_is_enough() -> None:
+    # along the line itself: of the ten returns, two are within half a metre of the points at 1.2 m, one at 1.3 m
+    module._check_places(report_of([placed("before", np.array([1.25, 0.0, 0.0]))]), PAIR)
+    with pytest.raises(ValueError, match=r"1 of 1 objects .* is 0\.9 m from its returns in the before session"):
+        module._check_places(report_of([placed("before", np.array([1.35, 0.0, 0.0]))]), PAIR)
 
 
-def test_gaps_add_up_over_the_axes() -> None:
-    scoring_points = line_points([0] * 20)
-    rows = np.arange(5, 15)
-    returns, own = [(0, pixel) for pixel in rows], scoring_points.points_odom[rows].astype(np.float64)
-    # 1.5 m in y and in z are 2.12 m
-    with pytest.raises(ValueError, match="is 2 m off"):
-        module._check_places((item("before", returns, own + np.array([0.0, 1.5, -1.5])),), scoring_points)
+def test_half_of_the_objects_elsewhere_are_too_many() -> None:
+    right, wrong = placed("before", 0.0), placed("after", 0.0)
+    module._check_places(report_of([right, wrong, right]), PAIR)
+    with pytest.raises(ValueError, match=r"1 of 2 objects .*: objects\[1\] is 40\.0 m from its returns in the after"):
+        module._check_places(report_of([right, wrong]), PAIR)
+    # an object without points or returns says nothing
+    mute = [item("before", [(0, 5)], np.zeros((0, 3))), item("before", (), POINTS), item("before", [(2, 5)], POINTS)]
+    module._check_places(report_of(mute), PAIR)
+    with pytest.raises(ValueError, match=r"1 of 2 objects"):
+        module._check_places(report_of([right, wrong, *mute]), PAIR)
+
+
+@pytest.mark.parametrize("n_named", [0, 2])
+def test_returns_of_the_after_session_are_merged_along_its_path(n_named: int) -> None:
+    # for each named keyframe, or else for each of the three scans
+    local = np.stack([make_pose(translation=(0.0, 3.0, 0.0))] * (n_named or 3))
+    for shift_m, told in ((3.0, None), (40.0, "objects do not lie")):
+        moved = placed("after", np.array([0.0, shift_m, 0.0]))
+        with taken_or_refused(told):
+            module._check_places(report_of([moved], local, n_named), PAIR)
 
 
 CELLS = line_points([0] * 20)

@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import make_pose, stream
-from cdpipe.model.report import ChangedObject
 from eval.scoring.answer_rows import find_rows_near_points
 from eval.scoring.merge_metrics import _along, compute_merge_errors, find_travel_directions, measure_overlap
 from eval.scoring.object_metrics import compute_box_iou, judge_kinds, match_objects
@@ -78,30 +76,6 @@ def test_coverage_is_of_reported_regions_alone(tiny_pair: Path, tiny_merge: np.n
         for regions in (report.regions, first, alone)
     ]
     assert coverage[1] == coverage[2] < coverage[0]
-
-
-def before_object(rows: np.ndarray, points: ScoringPoints, aside_m: float) -> ChangedObject:
-    returns = np.column_stack([points.scans(rows), points.pixels(rows)]).astype(np.int32)
-    at_m = points.points_odom[rows].astype(np.float64) + np.array([0.0, 0.0, aside_m])
-    return ChangedObject("before", "removed", -1, returns, at_m, 1.0)
-
-
-@pytest.mark.parametrize(("asides_m", "is_refused"), [((0.0, 40.0), False), ((40.0, 0.0), False), ((40.0, 30.0), True)])
-def test_an_answer_is_of_another_pair_only_if_all_its_objects_lie_aside(
-    tiny_pair: Path, tiny_merge: np.ndarray, asides_m: tuple[float, float], is_refused: bool
-) -> None:
-    points = load_ground_truth(tiny_pair).before.scoring_points
-    objects = tuple(
-        before_object(np.arange(first, first + 50), points, aside_m)
-        for first, aside_m in zip((0, 100), asides_m, strict=True)
-    )
-    report = replace(true_report(tiny_pair, tiny_merge), objects=objects)
-    if not is_refused:
-        assert scored(tiny_pair, report).row["n_objects"] == 2
-        return
-    # the object that lies nearest to its returns is the one that is named
-    with pytest.raises(InputError, match=r"objects\[1\]: object_points_map is \d+ m off"):
-        scored(tiny_pair, report)
 
 
 def test_a_change_that_no_row_belongs_to_is_not_observable(tiny_pair: Path) -> None:

@@ -12,7 +12,7 @@ from cdpipe.core.geometry import make_pose, yaw_pose
 from cdpipe.model.report import ChangedObject, ChangeReport
 from eval.scoring.scoring import score_stored
 from eval.truth.ground_truth import GroundTruth, load_ground_truth
-from tests.eval.scoring.test_scoring import ONES, scored, true_report, without_objects_and_regions
+from tests.eval.scoring.test_scoring import ONES, scored, to_map, true_report, without_objects_and_regions
 
 SCORES = (*ONES, "keyframe_coverage")
 
@@ -78,14 +78,14 @@ def test_an_answer_cannot_end_itself_at_the_merge(tiny_pair: Path, honest: Chang
         score_stored(load_ground_truth(tiny_pair), tiny_pair.parent / "answer")
 
 
-def everything_as_objects(truth: GroundTruth) -> tuple[ChangedObject, ...]:
+def everything_as_objects(truth: GroundTruth, merge: np.ndarray) -> tuple[ChangedObject, ...]:
     """Each 16th part of the scoring points of either session as an object."""
     objects = []
     for name in ("before", "after"):
         points = truth.sessions[name].scoring_points
         for rows in np.array_split(np.arange(len(points)), 16):
             returns = np.column_stack([points.scans(rows), points.pixels(rows)]).astype(np.int32)
-            at = points.points_odom[rows].astype(np.float64)
+            at = to_map(name, points.points_odom[rows].astype(np.float64), merge)
             objects.append(ChangedObject(name, "added", -1, returns, at, 1.0))
     return tuple(objects)
 
@@ -94,7 +94,7 @@ def test_calling_all_props_changes_costs_quality_and_f1(tiny_pair: Path, tiny_me
     report, truth = true_report(tiny_pair, tiny_merge), load_ground_truth(tiny_pair)
     taken = {tuple(pixel) for item in report.objects for pixel in item.returns.tolist()}
     others = []
-    for item in everything_as_objects(truth):
+    for item in everything_as_objects(truth, tiny_merge):
         free = np.array([tuple(pixel) not in taken for pixel in item.returns.tolist()])
         others.append(replace(item, returns=item.returns[free], points_map=item.points_map[free]))
     row = scored(tiny_pair, replace(report, objects=(*report.objects, *others))).row
@@ -105,7 +105,7 @@ def test_calling_all_props_changes_costs_quality_and_f1(tiny_pair: Path, tiny_me
 
 def test_the_whole_map_as_one_object_scores_nearly_nothing(tiny_pair: Path, honest: ChangeReport) -> None:
     truth = load_ground_truth(tiny_pair)
-    row = scored(tiny_pair, replace(honest, objects=everything_as_objects(truth))).row
+    row = scored(tiny_pair, replace(honest, objects=everything_as_objects(truth, honest.before_T_after))).row
     assert row["object_iou_point"] < 0.2
     assert row["object_pq"] == 0.0
 
@@ -191,7 +191,7 @@ def with_wrong(report: ChangeReport, truth: GroundTruth, what: str) -> ChangeRep
         walls = np.flatnonzero(truth.after.scoring_points.change == 0)[:40]
         points = truth.after.scoring_points
         returns = np.column_stack([points.scans(walls), points.pixels(walls)]).astype(np.int32)
-        at = points.points_odom[walls].astype(np.float64)
+        at = to_map("after", points.points_odom[walls].astype(np.float64), report.before_T_after)
         return replace(report, objects=(*report.objects, ChangedObject("after", "added", -1, returns, at, 9.0)))
     regions = report.regions
     n = len(regions.scores) + 1

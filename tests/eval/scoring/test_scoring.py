@@ -61,14 +61,18 @@ odometry_before odometry_after sensor_profile
 COLUMNS = COLUMN_TEXT.split()
 
 
-def true_objects(truth: GroundTruth) -> tuple[ChangedObject, ...]:
+def to_map(session: str, points_odom: np.ndarray, merge: np.ndarray) -> np.ndarray:
+    return points_odom if session == "before" else transform(merge, points_odom)
+
+
+def true_objects(truth: GroundTruth, merge: np.ndarray) -> tuple[ChangedObject, ...]:
     place = {change.id: index for index, change in enumerate(truth.pair.changes)}
     objects = []
     for change, rows in zip(truth.pair.changes, truth.change_rows, strict=True):
         scoring_points = truth.sessions[change.session].scoring_points
         returns = np.column_stack([scoring_points.scans(rows), scoring_points.pixels(rows)]).astype(np.int32)
         partner = -1 if change.partner is None else place[change.partner]
-        points = scoring_points.points_odom[rows].astype(np.float64)
+        points = to_map(change.session, scoring_points.points_odom[rows].astype(np.float64), merge)
         objects.append(ChangedObject(change.session, change.kind, place[change.id], returns, points, 1.0, partner))
     return tuple(objects)
 
@@ -92,7 +96,7 @@ def true_report(pair: Path, merge: np.ndarray) -> ChangeReport:
         before_T_after=merge,
         evidence={"map_points_before": 123.0},
         regions=regions,
-        objects=true_objects(truth),
+        objects=true_objects(truth, merge),
         seconds={
             "t_index_s": 0.5,
             "t_merge_s": 1.0,
@@ -496,12 +500,18 @@ def make_foreign(folder: Path, points_odom: list[np.ndarray]) -> None:
     np.savez(folder / "answer.npz", **arrays)
 
 
+def own_points(report: ChangeReport) -> list[np.ndarray]:
+    """The points of each object in the odom frame of its own session."""
+    frames = {"before": np.eye(4), "after": invert(report.before_T_after)}
+    return [transform(frames[item.session], item.points_map) for item in report.objects]
+
+
 def test_a_foreign_answer_of_points_is_scored_alike(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
     report = true_report(tiny_pair, tiny_merge)
     own = scored(tiny_pair, report).row
     folder = tiny_pair.parent / "answer"
     # 1 mm off: neighbouring cells of the tiny pair are farther than 0.1 m apart
-    make_foreign(folder, [item.points_map + 0.001 for item in report.objects])
+    make_foreign(folder, [points + 0.001 for points in own_points(report)])
     foreign = score_stored(load_ground_truth(tiny_pair), folder).row
     assert {name: foreign[name] for name in ONES} == {name: own[name] for name in ONES}
     assert foreign["n_merge_pairs"] == 14
@@ -514,7 +524,7 @@ def test_foreign_points_that_are_not_numbers_or_have_two_owners_are_refused(
     report = true_report(tiny_pair, tiny_merge)
     folder = tiny_pair.parent / "answer"
     write_answer(folder, "foreign", report)
-    points = [item.points_map.copy() for item in report.objects]
+    points = own_points(report)
     make_foreign(folder, [points[0], points[1], np.concatenate([points[2], points[0][:1]])])
     with pytest.raises(InputError, match="one owner at most"):
         score_stored(load_ground_truth(tiny_pair), folder)
