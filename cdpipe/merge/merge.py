@@ -10,13 +10,14 @@ indexed once (`registration`), hypotheses (`hypotheses`) that a walk along the p
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
 
-from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array, fit_rigid, transform, travelled_m
+from cdpipe.core.errors import InputError, InputWarning
+from cdpipe.core.geometry import Float64Array, fit_rigid, transform, transform_each, travelled_m
 from cdpipe.core.geometry.voxel import FINEST_CELL_M, max_coordinate_m
 from cdpipe.mapping.poses.recorded_frames import merge_as_mapped
 from cdpipe.merge.candidates import find_candidates, find_closest_pair, list_tries
@@ -45,6 +46,8 @@ _TOO_FEW = "no pair of similar places had enough points to be registered"
 # Largest displacement of a place by which a checked refinement may change a known alignment: a constant, or a share of
 # the path, which is what odometry drifts.
 _KNOWN_M, _KNOWN_SHARE = 1.0, 0.01
+# Share of the places that may fit farther away than that.
+_FAR_SHARE = 0.1
 # A path from which on its map is indexed around the places of the walk alone: these are half of it.
 _LONG_M = 400.0
 
@@ -105,7 +108,8 @@ def take_known_merge(
     Evidence: `is_known` is 1; the other measurements are those of a walk that starts at the known alignment. With
     `config.refine` the alignment is refined along the path, and stays as it is where the refinement does not fit, or
     where both maps are rings that lie apart (`rings`). A
-    checked refinement moves no place by more than 1 m or 1 % of the after path, if that is more.
+    checked refinement moves no place by more than 1 m or 1 % of the after path, if that is more. A warning tells where
+    the scans fit farther away than that, or nowhere.
 
     Args:
         before: The before session.
@@ -134,9 +138,9 @@ def take_known_merge(
     evidence = {**found.evidence, **measure_rings(before, after, config.seen_within_m)}
     local, refined = known_local, before_T_after
     walked = perf_counter()
-    within_m = np.inf
-    if config.refine == "checked":
-        within_m = max(_KNOWN_M, _KNOWN_SHARE * float(travelled_m(after.map.odom_T_keyframe)[-1]))
+    near_m = max(_KNOWN_M, _KNOWN_SHARE * float(travelled_m(after.map.odom_T_keyframe)[-1]))
+    within_m = near_m if config.refine == "checked" else np.inf
+    _warn_of_misfit(found, by_user.at(maps[1].positions[found.walk.keyframes]), maps[1].positions, near_m, config)
     has_refinement = config.refine != "none" and not explain_rings(evidence)
     if has_refinement and "both_ways_m" in evidence:
         place = maps[1].positions[found.walk.keyframes[0]]
@@ -156,6 +160,33 @@ def take_known_merge(
         "t_refine_s": perf_counter() - walked if has_refinement else 0.0,
     }
     return replace(merged, before_T_after=refined, evidence=evidence, local=local, seconds=seconds)
+
+
+def _warn_of_misfit(
+    found: Hypothesis, known: Float64Array, positions: Float64Array, near_m: float, config: MergeConfig
+) -> None:
+    """Warn where the scans fit elsewhere than a known merge puts them, or do not fit around it.
+
+    Args:
+        found: The walk that started at the known merge.
+        known: (A, 4, 4) the known `before_T_after` at each keyframe of the walk.
+        positions: (K, 3) positions of all after keyframes, after odom frame, metres.
+        near_m: What odometry may drift, metres.
+        config: Settings of the merge.
+    """
+    share, places = found.evidence.get("inlier_share", np.nan), positions[found.walk.keyframes]
+    moved_m = np.linalg.norm(transform_each(found.walk.before_T_after, places) - transform_each(known, places), axis=1)[
+        found.walk.fits >= config.min_inlier_share
+    ]
+    asked = "are both sessions in one frame? Without a known merge, it is searched for"
+    if not share >= config.min_inlier_share:
+        fit = "nothing fits" if np.isnan(share) else f"only {share:.0%} of the points fit"
+        text = f"known merge: {fit} the other map under it: {asked}"
+    elif np.mean(moved_m > near_m) > _FAR_SHARE:
+        text = f"known merge: the scans fit {np.median(moved_m):.2g} m beside it: {asked}"
+    else:
+        return
+    warnings.warn(text, InputWarning, stacklevel=2)
 
 
 def _require_reachable(before_T_after: Float64Array, before: PointMap, after: PointMap) -> None:

@@ -191,13 +191,13 @@ def _check_places(report: ChangeReport, sessions: Mapping[SessionName, SessionTr
     return in every session, so the other checks pass. Returns of the after session come into the map by the answer's
     own merge. A right answer may hold some such objects: where an odometry drifts, the passes of a place lie apart.
     """
-    to_map = {"before": np.asarray, "after": _alignment(report, sessions["after"]).to_map}
+    alignments = {"before": PathAlignment.rigid(np.eye(4)), "after": _alignment(report, sessions["after"])}
     judged, far = 0, []
     for index, item in enumerate(report.objects):
         scoring_points = sessions[item.session].scoring_points
         rows = scoring_points.rows_of_returns(item.returns) if len(item.returns) else ()
         if len(rows) and len(item.points_map):
-            points = to_map[item.session](scoring_points.points_odom[rows].astype(np.float64))
+            points = alignments[item.session].to_map(scoring_points.points_odom[rows].astype(np.float64))
             distance_m, _ = cKDTree(item.points_map).query(points)
             judged += 1
             if np.mean(distance_m <= _BESIDE_M) < _MIN_BESIDE:

@@ -1,7 +1,10 @@
 from __future__ import annotations
 
 import os
+import re
+import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -325,7 +328,8 @@ def test_a_checked_refinement_moves_a_known_merge_by_a_metre_at_most(
     config = CONFIG.model_copy(update={"refine": refine})
     for off_m in (0.8, 1.2):
         known = make_pose(translation=(0.0, off_m, 0.0)) @ true_before_T_after
-        merged = take_known_merge(tunnel_before, tunnel_after, known, config)
+        with nullcontext() if off_m < 1 else pytest.warns(InputWarning, match="1.2 m beside it"):
+            merged = take_known_merge(tunnel_before, tunnel_after, known, config)
         if refine == "local" or off_m < 1:
             assert path_error_m(merged, true_before_T_after) < 0.03
         else:
@@ -334,7 +338,8 @@ def test_a_checked_refinement_moves_a_known_merge_by_a_metre_at_most(
     # of one place as well
     before, after = stand(30.0, 0, np.eye(4)), stand(30.6, 1, AFTER_ODOM_T_WORLD)
     far = make_pose(translation=(0.0, 1.2, 0.0)) @ invert(AFTER_ODOM_T_WORLD)
-    merged = take_known_merge(before, after, far, config)
+    with pytest.warns(InputWarning, match="1.2 m beside it"):
+        merged = take_known_merge(before, after, far, config)
     if refine == "checked":
         np.testing.assert_array_equal(merged.before_T_after, far)
     else:
@@ -344,7 +349,8 @@ def test_a_checked_refinement_moves_a_known_merge_by_a_metre_at_most(
 def test_no_gate_is_asked_about_a_known_merge(tunnel_before: MappedSession, other_tunnel: MappedSession) -> None:
     for far_m in (0.0, 1000.0):
         known = make_pose(translation=(0.0, far_m, 0.0))
-        merged = take_known_merge(tunnel_before, other_tunnel, known, CONFIG)
+        with pytest.warns(InputWarning, match=r"only \d+% of the points fit|nothing fits"):
+            merged = take_known_merge(tunnel_before, other_tunnel, known, CONFIG)
         assert merged.is_accepted and merged.local is None
         np.testing.assert_array_equal(merged.before_T_after, known)
         assert explain_refusal(merged.evidence, CONFIG)
@@ -352,6 +358,28 @@ def test_no_gate_is_asked_about_a_known_merge(tunnel_before: MappedSession, othe
     small = replace(tunnel_before.map, points=points, nearest_m=one, seen_from=None)
     merged = take_known_merge(MappedSession(small, tunnel_before.descriptors), other_tunnel, np.eye(4), CONFIG)
     assert merged.is_accepted and merged.evidence == {"n_hypotheses": 0.0, "is_known": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("off_m", "told"),
+    [(0.0, None), (0.8, None), (1.5, r"fit 1\.5 m beside it"), (30.0, r"only \d+% of the points")],
+)
+@pytest.mark.parametrize("refine", ["none", "checked"])
+def test_a_known_merge_that_the_scans_contradict_is_told(
+    tunnel_before: MappedSession,
+    tunnel_after: MappedSession,
+    true_before_T_after: Float64Array,
+    off_m: float,
+    told: str | None,
+    refine: str,
+) -> None:
+    known = make_pose(translation=(0.0, off_m, 0.0)) @ true_before_T_after
+    config = CONFIG.model_copy(update={"refine": refine})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        take_known_merge(tunnel_before, tunnel_after, known, config)
+    assert [each.category for each in caught] == ([] if told is None else [InputWarning])
+    assert told is None or re.match(f"known merge: .*{told}.*one frame", str(caught[0].message))
 
 
 def stand(
