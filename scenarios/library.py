@@ -302,7 +302,8 @@ def _read_extended(path: Path, children: tuple[Path, ...]) -> Document:
     """Read a file and write it over the one it extends; `family` is its own name unless it gives one."""
     read = read_yaml(path)
     if not isinstance(read.value, dict):
-        raise ScenarioError(f"{path}: expected keys and values, got {type(read.value).__name__}")
+        found = "nothing in it" if read.value is None else type(read.value).__name__
+        raise ScenarioError(f"{path}: expected keys and values, got {found}")
     origins = dict(read.origins)
     value: dict[Any, Any] = dict(read.value)
     value.setdefault("family", family_of(path))

@@ -30,7 +30,7 @@ _ROUNDED = 1e-6
 
 
 def read_known_merge(path: Path, origins_m: Sequence[Sequence[float]] = (_ZERO, _ZERO)) -> Float64Array:
-    """Read a (4, 4) `before_T_after`: four lines of numbers, JSON, or JSON that has it by that name, as answers do.
+    """Read a (4, 4) `before_T_after`: lines of numbers, JSON, or JSON that has it by that name, as answers do.
 
     Args:
         path: The file.
@@ -89,12 +89,14 @@ def write_alignment(path: Path, before_T_after: Float64Array, along: PathAlignme
 
 
 def require_rigid(matrix: Any) -> Float64Array:
-    """Return the exact rigid transform next to a (4, 4) matrix that was perhaps rounded.
+    """Return the exact rigid transform next to a (4, 4) matrix, or its upper (3, 4), that was perhaps rounded.
 
     Raises:
         ValueError: It is none to 1e-6.
     """
     matrix = np.asarray(matrix, dtype=np.float64)
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, (0.0, 0.0, 0.0, 1.0)])
     if matrix.shape != (4, 4):
         raise ValueError(f"before_T_after is {matrix.shape}")
     if not np.isfinite(matrix).all():

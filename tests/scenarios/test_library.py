@@ -489,10 +489,10 @@ before:""",
     )
 
 
-@pytest.mark.parametrize("text", ["", "- 1\n- 2\n", "just words\n"])
-def test_a_file_without_keys_is_refused(tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize(("text", "told"), [("", "nothing in it"), ("- 1\n- 2\n", "list"), ("just words\n", "str")])
+def test_a_file_without_keys_is_refused(tmp_path: Path, text: str, told: str) -> None:
     path = written(tmp_path, text)
-    with pytest.raises(ScenarioError, match="expected keys and values"):
+    with pytest.raises(ScenarioError, match=f"expected keys and values, got {told}$"):
         load_scenario(path, 0)
 
 

@@ -32,9 +32,7 @@ def require_plain_file(path: Path, most_bytes: int | None = None, expected: str 
         what = "a folder" if stat.S_ISDIR(status.st_mode) else "a device or a pipe"
         raise InputError(f"{path}: cannot be read (it is {what}){end}")
     if most_bytes is not None and status.st_size > most_bytes:
-        raise InputError(
-            f"{path}: {status.st_size / 1e6:.0f} MB, more than the {most_bytes / 1e6:.0f} MB it may have{end}"
-        )
+        raise InputError(f"{path}: {_size(status.st_size)}, more than the {_size(most_bytes)} it may have{end}")
     return status.st_size
 
 
@@ -52,3 +50,7 @@ def read_bytes(path: Path, most_bytes: int | None = None, expected: str = "") ->
         raise InputError(f"{path}: cannot be read ({error.strerror}){f': {expected}' if expected else ''}") from error
     except MemoryError as error:
         raise InputError(f"{path}: {n_bytes / 1e9:.1f} GB, more than there is memory for") from error
+
+
+def _size(n_bytes: int) -> str:
+    return f"{n_bytes / 1e6:.0f} MB" if n_bytes >= 1e6 else f"{n_bytes / 1e3:.0f} kB"

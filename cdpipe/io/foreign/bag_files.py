@@ -35,6 +35,12 @@ _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8
 _MOST_POINTS = 10_000_000
 _MOST_POSES, _MOST_TRANSFORMS = 2_000_000, 20_000_000  # of one frame, and of all: 64 bytes each
 _OTHER_POSES = ": give --trajectory FILE, or --odometry kiss-icp"
+# What mends a bag that was cut short, by the end of its name.
+_WAYS_OUT = {
+    ".bag": ": if it was cut short, `rosbag reindex FILE` of ROS 1 mends it",
+    ".mcap": ": if it was cut short, `mcap recover FILE -o NEW` mends it",
+    ".db3": ": if it was cut short, `sqlite3 FILE .recover | sqlite3 NEW` mends it",
+}
 _MOST_TOPICS = 10_000
 _MOST_FRAMES = 8
 _STAMPS_AT_ONCE = 50  # 5 s of a recording
@@ -248,7 +254,8 @@ def _tells(path: str) -> Iterator[None]:
         if not isinstance(error, _ERRORS) and type(error).__module__.split(".")[0] not in _LIBRARIES:
             raise
         told = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: not a readable bag: {told[:300]}") from error
+        way_out = _WAYS_OUT.get(Path(path).suffix.lower(), "")
+        raise InputError(f"{path}: not a readable bag: {told[:300]}{way_out}") from error
 
 
 def _keep_chunks_at_0(bag: Any) -> None:

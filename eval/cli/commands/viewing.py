@@ -144,6 +144,8 @@ def _require_answer(
     """
     from cdpipe.core.errors import InputError
 
+    if answer is None and (after / "answer.json").is_file():
+        raise InputError(f"{after}: an answer, no session: name the session before, the one after and then the answer")
     if answer is None:
         raise InputError(
             f"{before} {after}: two sessions without an answer: `tunnelcd detect {before} {after} --out ANSWER` makes "

@@ -129,6 +129,10 @@ def test_a_bag_that_is_none_says_so(tmp_path: Path) -> None:
         path.write_bytes(content)
         assert "not a readable bag: it begins with none of b'#ROSBAG'" in said(path)
         assert "copy or record it again" in said(path)
+    whole = write_bag(tmp_path / "whole.bag", MADE)
+    (tmp_path / "cut.bag").write_bytes(whole.read_bytes()[:-2000])
+    assert "cut.bag: not a readable bag: " in said(tmp_path / "cut.bag")
+    assert "if it was cut short, `rosbag reindex FILE`" in said(tmp_path / "cut.bag")
 
 
 def test_topics_and_poses_that_a_bag_lacks_are_listed(tmp_path: Path) -> None:

@@ -20,7 +20,13 @@ def as_text(matrix: list[list[float]]) -> str:
 
 
 @pytest.mark.parametrize(
-    "text", [as_text(ROUNDED), json.dumps(ROUNDED), json.dumps({"status": "ok", "before_T_after": ROUNDED})]
+    "text",
+    [
+        as_text(ROUNDED),
+        as_text(ROUNDED[:3]),
+        json.dumps(ROUNDED),
+        json.dumps({"status": "ok", "before_T_after": ROUNDED}),
+    ],
 )
 def test_text_json_and_answers_are_read_and_rounding_is_taken_back(tmp_path: Path, text: str) -> None:
     (tmp_path / "T").write_text(text + "\n")

@@ -86,6 +86,7 @@ def test_view_writes_the_page_of_a_stored_answer(
     [
         (["before", "after"], "two sessions without an answer"),
         (["{answer}"], "an answer, without its sessions"),
+        (["before", "{answer}"], "an answer, no session: name the session before, the one after and then the answer"),
         (["after", "before", "{answer}"], "is it an answer to this pair"),
         (["before", "absent", "{answer}"], "absent: no such file or folder"),
         (["before", "after", "absent"], "absent/answer.json: missing"),

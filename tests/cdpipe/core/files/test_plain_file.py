@@ -21,3 +21,12 @@ def test_a_file_that_memory_does_not_hold_is_one_line(tmp_path: Path, monkeypatc
     monkeypatch.setattr(Path, "open", lambda *_: _TooLarge())
     with pytest.raises(InputError, match=r"^\S*a\.csv: 0\.0 GB, more than there is memory for$"):
         read_bytes(path)
+
+
+@pytest.mark.parametrize(
+    ("n_bytes", "told"), [(1_500, r"2 kB, more than the 1 kB"), (3_000_000, "3 MB, more than the 1 kB")]
+)
+def test_a_larger_file_is_named_with_its_size(tmp_path: Path, n_bytes: int, told: str) -> None:
+    (tmp_path / "a.csv").write_bytes(bytes(n_bytes))
+    with pytest.raises(InputError, match=rf"a\.csv: {told} it may have: expected a table$"):
+        read_bytes(tmp_path / "a.csv", 1_000, "expected a table")
