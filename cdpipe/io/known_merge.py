@@ -22,7 +22,7 @@ from cdpipe.io.answer_parts import FORMAT as ANSWER_FORMAT
 from cdpipe.model.alignment import PathAlignment
 
 FORMAT, FORMAT_VERSION = "tunnelcd-merge", 1
-_EXPECTED = "expected a 4x4 rigid transform, four lines of four numbers or JSON"
+_EXPECTED = "expected a 4x4 rigid transform, three or four lines of four numbers or JSON"
 _MOST_BYTES = 100_000_000  # an answer.json is one, too
 _ZERO = (0.0, 0.0, 0.0)
 # Largest difference of an entry from the nearest rotation's: files are rounded to six digits.
@@ -89,14 +89,16 @@ def write_alignment(path: Path, before_T_after: Float64Array, along: PathAlignme
 
 
 def require_rigid(matrix: Any) -> Float64Array:
-    """Return the exact rigid transform next to a (4, 4) matrix, or its upper (3, 4), that was perhaps rounded.
+    """Return the exact rigid transform next to a (4, 4) matrix, or its upper three rows, that was perhaps rounded.
+
+    The rows may be in one line of twelve numbers, as KITTI writes poses.
 
     Raises:
         ValueError: It is none to 1e-6.
     """
     matrix = np.asarray(matrix, dtype=np.float64)
-    if matrix.shape == (3, 4):
-        matrix = np.vstack([matrix, (0.0, 0.0, 0.0, 1.0)])
+    if matrix.size == 12 and matrix.shape != (4, 3):
+        matrix = np.vstack([matrix.reshape(3, 4), (0.0, 0.0, 0.0, 1.0)])
     if matrix.shape != (4, 4):
         raise ValueError(f"before_T_after is {matrix.shape}")
     if not np.isfinite(matrix).all():

@@ -39,6 +39,7 @@ from cdpipe.merge.registration import (
     motion_between,
 )
 from cdpipe.merge.rings import explain_rings, measure_rings
+from cdpipe.merge.walk import SHARED_M
 from cdpipe.model.config import MergeConfig
 from cdpipe.model.types import MappedSession, MergedMaps, PointMap
 
@@ -109,7 +110,7 @@ def take_known_merge(
     `config.refine` the alignment is refined along the path, and stays as it is where the refinement does not fit, or
     where both maps are rings that lie apart (`rings`). A
     checked refinement moves no place by more than 1 m or 1 % of the after path, if that is more. A warning tells where
-    the scans fit farther away than that, or nowhere.
+    the scans fit farther away than that or nowhere, or cannot tell.
 
     Args:
         before: The before session.
@@ -165,7 +166,7 @@ def take_known_merge(
 def _warn_of_misfit(
     found: Hypothesis, known: Float64Array, positions: Float64Array, near_m: float, config: MergeConfig
 ) -> None:
-    """Warn where the scans fit elsewhere than a known merge puts them, or do not fit around it.
+    """Warn where the scans fit elsewhere than a known merge puts them, do not fit around it, or cannot tell.
 
     Args:
         found: The walk that started at the known merge.
@@ -174,18 +175,22 @@ def _warn_of_misfit(
         near_m: What odometry may drift, metres.
         config: Settings of the merge.
     """
-    share, places = found.evidence.get("inlier_share", np.nan), positions[found.walk.keyframes]
-    moved_m = np.linalg.norm(transform_each(found.walk.before_T_after, places) - transform_each(known, places), axis=1)[
-        found.walk.fits >= config.min_inlier_share
-    ]
-    asked = "are both sessions in one frame? Without a known merge, it is searched for"
-    if not share >= config.min_inlier_share:
-        fit = "nothing fits" if np.isnan(share) else f"only {share:.0%} of the points fit"
-        text = f"known merge: {fit} the other map under it: {asked}"
-    elif np.mean(moved_m > near_m) > _FAR_SHARE:
-        text = f"known merge: the scans fit {np.median(moved_m):.2g} m beside it: {asked}"
+    fits, places = found.walk.fits, positions[found.walk.keyframes]
+    share, ratio = (found.evidence.get(name, np.nan) for name in ("inlier_share", "hessian_ratio"))
+    if not np.isfinite(fits).any():
+        told = f"the paths do not come within {SHARED_M:g} m of each other under it, so it was not checked"
+    elif not share >= config.min_inlier_share:
+        told = f"{'nothing fits' if np.isnan(share) else f'only {share:.0%} of the points fit'} the other map near it"
     else:
-        return
+        moved_m = np.linalg.norm(
+            transform_each(found.walk.before_T_after, places) - transform_each(known, places), axis=1
+        )[fits >= config.min_inlier_share]
+        far_m = moved_m[moved_m > near_m]
+        slides = not ratio >= config.min_hessian_ratio  # along a smooth drift
+        if slides or len(far_m) == 0 or len(far_m) < max(min(2, len(moved_m)), _FAR_SHARE * len(moved_m)):
+            return
+        told = f"the scans fit {np.median(far_m):.1f} m beside it, at {len(far_m)} of {len(moved_m)} places"
+    text = f"known merge: {told}: are both sessions in one frame? Without a known merge, it is searched for"
     warnings.warn(text, InputWarning, stacklevel=2)
 
 

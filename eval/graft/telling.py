@@ -16,7 +16,7 @@ _MERGES = {"given": "merge as given", "tunnelcd": "merge as `tunnelcd` found it"
 
 _NOTHING = (
     "nothing is grafted: a real pair without changes",
-    "nothing is grafted: taken as unchanged: what did change between the recordings will count as a false alarm",
+    "nothing is grafted, and the pair is taken as unchanged: what did change between the recordings is a false alarm",
 )
 
 

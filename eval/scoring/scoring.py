@@ -109,7 +109,7 @@ def score_stored(truth: GroundTruth, folder: Path, *, may_end_early: bool = Fals
             f"{folder / 'answer.json'}: until = {answer.until!r}: a plan alone ends a method early; leave it out, and "
             "give the whole answer"
         )
-    check_answer(answer, truth, folder)
+    check_answer(answer, truth, folder, is_of_pair=may_end_early)
     return score_answer(answer, truth)
 
 

@@ -53,4 +53,4 @@ def read_bytes(path: Path, most_bytes: int | None = None, expected: str = "") ->
 
 
 def _size(n_bytes: int) -> str:
-    return f"{n_bytes / 1e6:.0f} MB" if n_bytes >= 1e6 else f"{n_bytes / 1e3:.0f} kB"
+    return f"{n_bytes / 1e3:.1f} kB" if n_bytes < 1e5 else f"{n_bytes / 1e6:.{int(n_bytes < 1e7)}f} MB"

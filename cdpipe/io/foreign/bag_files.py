@@ -12,7 +12,7 @@ import tempfile
 import warnings
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -237,15 +237,18 @@ def _bag(path: str) -> Iterator[Any]:
     with _tells(path), tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         found = find_paths(Path(path), Path(folder))
-        with AnyReader(found, default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+        with _tells(path, _WAYS_OUT.get(found[0].suffix.lower(), "") if found else ""):
+            reader = AnyReader(found, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            reader.open()
+        with closing(reader) as bag:
             require_one_recording(bag.readers)
             _keep_chunks_at_0(bag)
             yield bag
 
 
 @contextmanager
-def _tells(path: str) -> Iterator[None]:
-    """Let what a damaged bag provokes become one `InputError`."""
+def _tells(path: str, way_out: str = "") -> Iterator[None]:
+    """Let what a damaged bag provokes become one `InputError`, with the way out at its end."""
     try:
         yield
     except InputError:
@@ -254,7 +257,6 @@ def _tells(path: str) -> Iterator[None]:
         if not isinstance(error, _ERRORS) and type(error).__module__.split(".")[0] not in _LIBRARIES:
             raise
         told = " ".join(str(error).split()) or type(error).__name__
-        way_out = _WAYS_OUT.get(Path(path).suffix.lower(), "")
         raise InputError(f"{path}: not a readable bag: {told[:300]}{way_out}") from error
 
 

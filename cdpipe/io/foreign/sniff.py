@@ -54,6 +54,7 @@ FORMATS = {
     "pcap": Format("an Ouster PCAP", (".pcap", ".pcapng"), tuple((0, magic) for magic in _PCAP)),
 }
 """One row is one format, by the name that `--format` takes."""
+_OF_AN_ANSWER = {"objects.ply", "surface.ply"}  # they are no scans
 # Sub-folders in which other people's tools put the scans.
 _SCAN_FOLDERS = ("velodyne", "pcd", "scans", "clouds", "velodyne_points/data", "lidar", "points")
 
@@ -119,9 +120,10 @@ def _formats_in(folder: Path) -> dict[str, int]:
 
 
 def _guess_folder(folder: Path) -> str:
-    if (folder / "answer.json").is_file():  # its objects.ply is no scan
-        raise InputError(f"{folder}: an answer of `detect`, no session: name the two sessions, then the answer")
     found = _formats_in(folder)
+    has_scans = found.keys() - {"ply"} or {each.name for each in find_scans(folder, "ply")} - _OF_AN_ANSWER
+    if (folder / "answer.json").is_file() and not has_scans:
+        raise InputError(f"{folder}: an answer, no session: name the session that it was made from")
     if len(found) > 1:
         told = ", ".join(f"{count} {name}" for name, count in found.items())
         raise InputError(f"{folder}: scans of several formats ({told}): name one, --format {' or '.join(found)}")

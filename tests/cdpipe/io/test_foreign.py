@@ -260,11 +260,14 @@ def test_a_pair_and_an_answer_are_told_from_a_session(tmp_path: Path) -> None:
         (tmp_path / "pair" / name).mkdir(parents=True)
     assert said(tmp_path / "pair").endswith(f"no session: name {tmp_path}/pair/before and {tmp_path}/pair/after")
     (tmp_path / "answer").mkdir()
-    for name in ("answer.json", "objects.csv", "objects.ply", "regions.csv"):
+    for name in ("answer.json", "objects.csv", "objects.ply", "regions.csv", "surface.ply"):
         (tmp_path / "answer" / name).write_text("")
-    assert said(tmp_path / "answer").endswith(
-        "an answer of `detect`, no session: name the two sessions, then the answer"
-    )
+    assert said(tmp_path / "answer").endswith("an answer, no session: name the session that it was made from")
+    # an answer that was saved beside scans, or into a session
+    (tmp_path / "answer" / "000000.ply").write_text("")
+    assert guess_format(tmp_path / "answer") == "ply"
+    (tmp_path / "answer" / "session.json").write_text("{}")
+    assert guess_format(tmp_path / "answer") == "session"
 
 
 def test_a_folder_without_scans_tells_what_it_holds(tmp_path: Path) -> None:

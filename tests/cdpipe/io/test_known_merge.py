@@ -24,6 +24,7 @@ def as_text(matrix: list[list[float]]) -> str:
     [
         as_text(ROUNDED),
         as_text(ROUNDED[:3]),
+        as_text(ROUNDED[:3]).replace("\n", " "),
         json.dumps(ROUNDED),
         json.dumps({"status": "ok", "before_T_after": ROUNDED}),
     ],

@@ -20,9 +20,10 @@ from cdpipe.merge import merge
 from cdpipe.merge.candidates import first_keyframes
 from cdpipe.merge.evidence import explain_refusal, measure_fit
 from cdpipe.merge.global_registration import is_kiss_matcher_installed
-from cdpipe.merge.hypotheses import Start, judge
+from cdpipe.merge.hypotheses import Hypothesis, Start, judge
 from cdpipe.merge.merge import merge_maps, take_known_merge
 from cdpipe.merge.registration import IndexedMap, register
+from cdpipe.merge.walk import Walk
 from cdpipe.model.config import MergeConfig, load_config
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps
 from cdpipe.pipeline import detect
@@ -349,7 +350,7 @@ def test_a_checked_refinement_moves_a_known_merge_by_a_metre_at_most(
 def test_no_gate_is_asked_about_a_known_merge(tunnel_before: MappedSession, other_tunnel: MappedSession) -> None:
     for far_m in (0.0, 1000.0):
         known = make_pose(translation=(0.0, far_m, 0.0))
-        with pytest.warns(InputWarning, match=r"only \d+% of the points fit|nothing fits"):
+        with pytest.warns(InputWarning, match="do not come within 5 m" if far_m else r"only \d+% of the points fit"):
             merged = take_known_merge(tunnel_before, other_tunnel, known, CONFIG)
         assert merged.is_accepted and merged.local is None
         np.testing.assert_array_equal(merged.before_T_after, known)
@@ -362,7 +363,7 @@ def test_no_gate_is_asked_about_a_known_merge(tunnel_before: MappedSession, othe
 
 @pytest.mark.parametrize(
     ("off_m", "told"),
-    [(0.0, None), (0.8, None), (1.5, r"fit 1\.5 m beside it"), (30.0, r"only \d+% of the points")],
+    [(0.0, None), (0.8, None), (1.5, r"fit 1\.5 m beside it"), (30.0, "do not come within 5 m")],
 )
 @pytest.mark.parametrize("refine", ["none", "checked"])
 def test_a_known_merge_that_the_scans_contradict_is_told(
@@ -380,6 +381,40 @@ def test_a_known_merge_that_the_scans_contradict_is_told(
         take_known_merge(tunnel_before, tunnel_after, known, config)
     assert [each.category for each in caught] == ([] if told is None else [InputWarning])
     assert told is None or re.match(f"known merge: .*{told}.*one frame", str(caught[0].message))
+
+
+def test_a_right_known_merge_of_stations_that_lie_apart_is_told_to_be_unchecked() -> None:
+    true = invert(AFTER_ODOM_T_WORLD)
+    for apart_m, told in ((3.0, None), (5.5, "do not come within 5 m of each other under it, so it was not checked")):
+        stations = stand(30.0, 0, np.eye(4)), stand(30.0 + apart_m, 1, AFTER_ODOM_T_WORLD)
+        with nullcontext() if told is None else pytest.warns(InputWarning, match=told):
+            take_known_merge(*stations, true, CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("moved_m", "ratio", "told"),
+    [
+        ([0.02] * 9, 1.0, None),
+        ([0.02] * 8 + [1.28], 1.0, None),
+        ([0.02] * 7 + [1.28, 1.32], 1.0, r"fit 1\.3 m beside it, at 2 of 9 places"),
+        ([1.5] * 9, 1.0, r"fit 1\.5 m beside it, at 9 of 9 places"),
+        ([1.5] * 9, 0.01, None),  # the walk slid along a smooth drift
+        ([0.02] * 39 + [1.5] * 3, 1.0, None),
+        ([0.02] * 37 + [1.5] * 5, 1.0, "at 5 of 42 places"),
+        ([1.5], 1.0, "at 1 of 1 places"),
+        ([], 1.0, None),
+    ],
+)
+def test_the_places_that_contradict_a_known_merge(moved_m: list[float], ratio: float, told: str | None) -> None:
+    n = len(moved_m)
+    # of one more keyframe the walk came near the path and nothing fits
+    poses = make_pose(translation=np.column_stack([np.zeros((n + 1, 2)), [*moved_m, 40.0]]))
+    fits = np.append(np.full(n, 0.9), 0.2)
+    walked = Walk(np.arange(n + 1), poses, np.zeros((n + 1, 6, 6)), fits, np.zeros(n + 1))
+    found = Hypothesis(np.eye(4), walked, {"inlier_share": 0.9, "hessian_ratio": ratio})
+    known = np.repeat(np.eye(4)[None], n + 1, axis=0)
+    with nullcontext() if told is None else pytest.warns(InputWarning, match=told):
+        merge._warn_of_misfit(found, known, np.zeros((n + 1, 3)), 1.0, CONFIG)
 
 
 def stand(

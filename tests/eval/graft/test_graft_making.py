@@ -174,7 +174,7 @@ def test_the_command_line(simulated: Path, tmp_path: Path, command: Command) -> 
     code, out, _ = command("graft", simulated / "before", "--out", tmp_path / "null")
     assert (code, "a real pair without changes" in out) == (0, True)
     code, out, _ = command("graft", simulated / "before", simulated / "after", "--out", tmp_path / "two")
-    assert (code, "taken as unchanged: what did change between the recordings" in out) == (0, True)
+    assert (code, "the pair is taken as unchanged: what did change between the recordings" in out) == (0, True)
     own = tmp_path / "own.yaml"
     own.write_text(
         f"recording: {{sessions: [{simulated / 'before'}], reach_m: 4, clearance_m: 0.5}}\n{props.read_text()}"

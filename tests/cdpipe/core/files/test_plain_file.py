@@ -24,9 +24,10 @@ def test_a_file_that_memory_does_not_hold_is_one_line(tmp_path: Path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("n_bytes", "told"), [(1_500, r"2 kB, more than the 1 kB"), (3_000_000, "3 MB, more than the 1 kB")]
+    ("n_bytes", "told"),
+    [(1_040, "1.0 kB"), (1_500, "1.5 kB"), (999_999, "1.0 MB"), (3_260_000, "3.3 MB"), (23_400_000, "23 MB")],
 )
 def test_a_larger_file_is_named_with_its_size(tmp_path: Path, n_bytes: int, told: str) -> None:
     (tmp_path / "a.csv").write_bytes(bytes(n_bytes))
-    with pytest.raises(InputError, match=rf"a\.csv: {told} it may have: expected a table$"):
-        read_bytes(tmp_path / "a.csv", 1_000, "expected a table")
+    with pytest.raises(InputError, match=rf"a\.csv: {told}, more than the 0\.9 kB it may have: expected a table$"):
+        read_bytes(tmp_path / "a.csv", 900, "expected a table")
