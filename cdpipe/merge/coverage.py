@@ -6,9 +6,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array, transform_each
 from cdpipe.merge.walk import SHARED_M
-from cdpipe.model.aligned import alignment_of
+from cdpipe.model.aligned import alignment_of, merge_at_scans
 from cdpipe.model.report import ChangeReport, Coverage
 
 
@@ -36,7 +36,9 @@ def measure_coverage(
             "is it an answer to this pair?"
         )
     before = before_odom_T_sensor[:, :3, 3]
-    after = alignment_of(report, after_odom_T_sensor).to_map(after_odom_T_sensor[:, :3, 3])
+    alignment_of(report, after_odom_T_sensor)  # or it is an answer to another pair
+    local = merge_at_scans(report, np.arange(len(after_odom_T_sensor)))
+    after = transform_each(local, after_odom_T_sensor[:, :3, 3])
     distances_m, _ = cKDTree(after).query(before, distance_upper_bound=SHARED_M)
     is_near = np.isfinite(distances_m)
     steps_m = np.linalg.norm(np.diff(before, axis=0), axis=1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array, require_poses
+from cdpipe.core.geometry import Float64Array, Int64Array, require_poses
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.report import ChangeReport
 
@@ -35,3 +35,18 @@ def alignment_of(report: ChangeReport, after_odom_T_sensor: Float64Array) -> Pat
     except ValueError as error:
         raise InputError(f"the answer's {error}") from error
     return PathAlignment(after_odom_T_sensor[scans, :3, 3], local)
+
+
+def merge_at_scans(report: ChangeReport, scans: Int64Array) -> Float64Array:
+    """Return the (N, 4, 4) merge that a report states at each of (N,) after scans: that at the nearest keyframe.
+
+    Where an odometry lost its way, its path lies over itself: there the scan tells the merge, and the place does not.
+    """
+    local, keyframes = report.local_before_T_after, report.keyframe_scans[1]
+    if local is None:
+        return np.broadcast_to(report.before_T_after, (len(scans), 4, 4))
+    if len(keyframes) == 0:
+        return local[scans]
+    order = np.argsort(keyframes)
+    between = (keyframes[order][1:] + keyframes[order][:-1]) / 2
+    return np.asarray(local[order[np.searchsorted(between, scans)]])

@@ -44,7 +44,8 @@ class PosedScan:
         second_from: Pixels from this one on are second returns of the beams from pixel 0 on; None: one return a beam.
         intensity: (N,) float32 intensity of each return in the recording's own unit, None where it has none.
         airborne_sensor: (D, 3) returns that were left out as mist or dust; None where the air is clear.
-        pose_ns: Time of the pose, where the motion through the session's poses deskewed the points; else None.
+        pose_ns: Time of the pose, where the motion through the session's poses deskewed the points, or a finer one that
+            it stands for; else None.
     """
 
     index: int

@@ -20,6 +20,7 @@ from cdpipe.core.geometry import (
 )
 from cdpipe.core.yamlfile import suggest
 from cdpipe.io.answer import Answer
+from cdpipe.model.aligned import merge_at_scans
 from cdpipe.model.report import MAX_DISPLACEMENT_M, ChangedObject, ChangeRegions, ChangeReport, SurfaceField
 from cdpipe.model.types import SessionName
 from eval.scoring.answer_rows import POINT_RADIUS_M, find_rows_near_points
@@ -208,7 +209,7 @@ def _check_places(report: ChangeReport, sessions: Mapping[SessionName, SessionTr
     own merge, each as it holds at its scan. One object alone may lie up to 2 m away: where an odometry drifts, the
     passes of a place lie apart.
     """
-    distances_m = {}
+    distances_m: dict[int, Float64Array] = {}
     for index, item in enumerate(report.objects):
         scoring_points = sessions[item.session].scoring_points
         rows = scoring_points.rows_of_returns(item.returns) if len(item.returns) else np.zeros(0, np.int64)
@@ -216,9 +217,9 @@ def _check_places(report: ChangeReport, sessions: Mapping[SessionName, SessionTr
         if len(rows) and len(item.points_map):
             points = scoring_points.points_odom[rows].astype(np.float64)
             if item.session == "after":
-                points = transform_each(_merge_at(report, scoring_points.scans(rows)), points)
+                points = transform_each(merge_at_scans(report, scoring_points.scans(rows)), points)
             # a tree of many equal points takes minutes
-            distances_m[index], _ = cKDTree(np.unique(item.points_map, axis=0)).query(points)
+            distances_m[index] = np.asarray(cKDTree(np.unique(item.points_map, axis=0)).query(points)[0])
     far = [index for index, each in distances_m.items() if np.mean(each <= _BESIDE_M) < _MIN_BESIDE]
     if not far or 2 * len(far) < len(distances_m):
         return
@@ -230,18 +231,6 @@ def _check_places(report: ChangeReport, sessions: Mapping[SessionName, SessionTr
             "object_points_map in another frame, or is it an answer to another pair, to a converted copy of this one, "
             "or to the sessions the other way round?"
         )
-
-
-def _merge_at(report: ChangeReport, scans: Int64Array) -> Float64Array:
-    """Return the (N, 4, 4) merge that the answer states at each of (N,) after scans: that of the nearest keyframe."""
-    local, keyframes = report.local_before_T_after, report.keyframe_scans[1]
-    if local is None:
-        return np.broadcast_to(report.before_T_after, (len(scans), 4, 4))
-    if len(keyframes) == 0:
-        return local[scans]
-    order = np.argsort(keyframes)
-    between = (keyframes[order][1:] + keyframes[order][:-1]) / 2
-    return local[order[np.searchsorted(between, scans)]]
 
 
 def _check_points(

@@ -40,9 +40,15 @@ _AGREE_M = 0.015
 # There is a jump before a scan that moves by more when it is registered with the scans before it. The most of a session
 # is 1 to 6 cm at constant drift or with true poses, 9 cm in mist or among movers (the same tunnels).
 _JUMP_M = 0.15
+# There is one, too, if so many more of its points are off the walls than of the median block's: at jumps of 1 to 2.5 m
+# and turns of 58 to 180 degrees 0.29 and more, elsewhere 0.05 at most.
+_BESIDE_SHARE = 0.2
 # Least share of the recorded way, block by block, that a registration keeps. Five scans each of an OS0-8 on a driving
 # car, which lock onto their rings, keep 0.16 and 0.22.
 _LEAST_WAY = 0.8
+# The sensor stands at the steps that seem wrong if their median is as short as this, and this share of the odometry's:
+# an OS0-8 that locks onto its rings moves by 0.00 to 0.06 m from scan to scan where it drives 0.5 to 4 m.
+_STANDS_M, _STANDS_SHARE = 0.03, 0.1
 _ROUNDING = 1e-9  # of an interpolated percentile
 # A scan is bent if so many of its points are off the walls, and so many times as many as of the scans around it.
 _BENT_SHARE, _BENT_FACTOR = 0.05, 3.0
@@ -90,7 +96,8 @@ def make_consistent(
 ) -> ConsistentScans:
     """Return a session with poses under which its scans agree with one another; the recorded ones where they do so.
 
-    Time grows with the number of scans; the points of a long session are in a temporary file.
+    Time grows with the number of scans; the points of a long session are in a temporary file, except those of scans
+    that are deskewed anew (0.1 MB each).
 
     Args:
         source: The session.
@@ -155,9 +162,10 @@ def _agree(scans: Samples, poses: Float64Array, told: _Told) -> bool:
 def _has_jump(scans: Samples, poses: Float64Array) -> bool:
     """Return whether the last scan of any block moves by more than `_JUMP_M` in the map of the scans before the block.
 
-    A sweep does not see one jump: the scans on either side of it hold one another.
+    Or whether it lies beside the walls there, where no pose near by fits. A sweep does not see one jump: the scans on
+    either side of it hold one another.
     """
-    path_m = scans.path_m
+    path_m, misfits = scans.path_m, []
     bounds = np.append(np.flatnonzero(np.diff(np.floor(path_m / _BLOCK_M))) + 1, len(poses))
     for start, end in pairwise(bounds.tolist()):
         before = np.arange(np.searchsorted(path_m, path_m[start] - _AROUND_M), start)
@@ -168,15 +176,22 @@ def _has_jump(scans: Samples, poses: Float64Array) -> bool:
         found = register_scan(scans.of_scan(end - 1), last, [last], target, FOLLOWING)
         if moved_m(last[None], found.pose[None])[0] > _JUMP_M:
             return True
-    return False
+        misfits.append(found.misfit)
+    usual = np.percentile(misfits, 50, method="lower") if misfits else 0.0
+    return max(misfits, default=0.0) > usual + _BESIDE_SHARE
 
 
 def _slides(scans: Samples, poses: Float64Array, is_wrong: BoolArray) -> bool:
     """Return whether the (S, 4, 4) registered poses lost a part of the recorded way, as rings that match rings do.
 
     Few beams, or scans far apart, meet the ground in rings around the sensor. Where these hold a registration, the
-    sensor seems to stand. Blocks with wrong steps of the odometry (S - 1,) tell nothing.
+    sensor seems to stand: in whole blocks, or at the steps of the odometry (S - 1,) that seem wrong then.
     """
+    steps_m, odometry_m = (
+        np.linalg.norm(np.diff(each[:, :3, 3], axis=0), axis=1)[is_wrong] for each in (poses, scans.odometry)
+    )
+    if is_wrong.any() and np.median(steps_m) < min(_STANDS_M, _STANDS_SHARE * np.median(odometry_m)):
+        return True
     ends = np.append(np.unique(np.floor(scans.path_m / _BLOCK_M), return_index=True)[1], len(poses) - 1)
     way_m, recorded_m = (np.linalg.norm(np.diff(each[ends, :3, 3], axis=0), axis=1) for each in (poses, scans.odometry))
     n_wrong = np.diff(np.append(0, np.cumsum(is_wrong))[ends])

@@ -23,6 +23,7 @@ from cdpipe.mapping.poses.scan_registration import (
     Samples,
     Target,
     motion_through,
+    moved_m,
     orthonormal,
     register_scan,
     sample_rows,
@@ -37,6 +38,9 @@ FOLLOWING = Registration(voxel_m=0.3, correspondence_m=1.0, robust_m=0.2, step_m
 # and so many more of all points lie on walls.
 _OFF_SHARE, _GAIN = 0.1, 0.1
 _USUAL_SCANS = 20
+# The step to a scan that is found anew is wrong if the odometry errs by more. A scan before a wrong step is half
+# deskewed by it, and the step to it is right.
+_WRONG_M = 0.1
 _SEEKING = Registration(voxel_m=0.3, correspondence_m=2.0, robust_m=0.5, step_m=0.5, step_rad=0.5)
 _HEADINGS = 18
 
@@ -68,7 +72,7 @@ def follow(scans: Samples, on_scan: Callable[[], None]) -> tuple[Float64Array, B
             if at.misfit > np.median(misfits) + _OFF_SHARE:  # where all scans are off, none is looked for
                 again = _find_again(scans, found, last, guess, index, target)
                 if again.on_share > at.on_share + _GAIN and again.misfit < at.misfit / 2:
-                    at, is_wrong[min(last, index)] = again, True
+                    at, is_wrong[min(last, index)] = again, moved_m(guess[None], again.pose[None])[0] > _WRONG_M
                     scans.replace(index, _deskewed(scans, scans.source.scan(index), found, last, at.pose).points_sensor)
             misfits.append(at.misfit)
             found[index] = at.pose
@@ -83,10 +87,10 @@ def _choose_start(scans: Samples) -> int:
     """
     n = len(scans.odometry)
     for eighth in (4, 2, 6, 1, 7, 3, 5):
-        start = n * eighth // 8
+        start = min(n * eighth // 8, n - 2)
         target = Target(scans, scans.odometry, np.array([start]), scans.odometry[start, :3, 3], FOLLOWING.voxel_m)
-        guess = scans.odometry[min(start + 1, n - 1)]
-        at = register_scan(scans.of_scan(min(start + 1, n - 1)), guess, [guess], target, FOLLOWING)
+        guess = scans.odometry[start + 1]
+        at = register_scan(scans.of_scan(start + 1), guess, [guess], target, FOLLOWING)
         if at.misfit <= _OFF_SHARE:
             return start
     return n // 2

@@ -76,6 +76,12 @@ def _stretches(recorded_T_keyframe: Float64Array, odom_T_keyframe: Float64Array)
     return np.append(0, np.cumsum(moved_m(recorded, mapped) > _LEAP_M))
 
 
+def _longest_stretch(point_map: PointMap) -> Int64Array:
+    """Return the (N,) keyframes of the longest stretch in which the recorded odometry did not lose its way."""
+    stretches = _stretches(_recorded_T_keyframe(point_map), point_map.odom_T_keyframe)
+    return np.flatnonzero(stretches == np.argmax(np.bincount(stretches)))
+
+
 def regions_as_mapped(regions: ChangeRegions, before: PointMap) -> ChangeRegions:
     """Return regions in the frame of a before map from those in the frame of its recorded odometry."""
     if before.recorded_T_sensor is None:
@@ -89,13 +95,19 @@ def merge_as_mapped(before_T_after: Float64Array, before: PointMap, after: Point
     """Return a (4, 4) merge of the recorded frames as an alignment of two maps with consistent poses.
 
     What an after keyframe saw lands where the merge puts it. The alignment is the merge itself where both maps have the
-    recorded poses.
+    recorded poses. Where an odometry lost its way, the merge is that of the longest stretch, and what lies outside of
+    it has the alignment of its end.
     """
     if _is_as_recorded(before) and _is_as_recorded(after):
         return PathAlignment.rigid(before_T_after)
     recorded_T_keyframe, odom_T_keyframe = before_T_after @ _recorded_T_keyframe(after), after.odom_T_keyframe
-    map_T_recorded = _transforms_at(recorded_T_keyframe[:, :3, 3], _recorded_T_keyframe(before), before.odom_T_keyframe)
-    return PathAlignment(odom_T_keyframe[:, :3, 3], map_T_recorded @ recorded_T_keyframe @ invert(odom_T_keyframe))
+    known, kept = (_longest_stretch(each) for each in (before, after))
+    map_T_recorded = _transforms_at(
+        recorded_T_keyframe[:, :3, 3], _recorded_T_keyframe(before)[known], before.odom_T_keyframe[known]
+    )
+    local = map_T_recorded @ recorded_T_keyframe @ invert(odom_T_keyframe)
+    nearest = kept[np.searchsorted((kept[1:] + kept[:-1]) / 2, np.arange(len(local)))]
+    return PathAlignment(odom_T_keyframe[:, :3, 3], local[nearest])
 
 
 def recorded_T_map(point_map: PointMap, places_odom: Float64Array) -> Float64Array:

@@ -43,6 +43,14 @@ def test_a_local_alignment_counts_where_it_holds() -> None:
     assert (found.compared_m, found.unseen_m) == (20.0, 0.0)
 
 
+def test_a_lost_odometry_that_lies_over_its_own_path_does_not_bend_it() -> None:
+    # from its sixth scan on the after odometry comes back over its first half; the answer knows where it is
+    before, after = straight(0, 20), np.concatenate([straight(0, 10), straight(0, 8)])
+    local = make_pose(translation=np.where(np.arange(11)[:, None] < 6, 0.0, [[12.0, 0.0, 0.0]]))
+    found = measure_coverage(replace(EMPTY, local_before_T_after=local), before, after)
+    assert (found.compared_m, found.unseen_m) == (20.0, 0.0)
+
+
 def test_a_path_of_one_scan_has_no_length() -> None:
     found = measure_coverage(EMPTY, straight(0, 0), straight(0, 4))
     assert (found.compared_m, found.unseen_m, found.is_near.tolist()) == (0.0, 0.0, [True])

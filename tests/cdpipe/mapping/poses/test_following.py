@@ -85,6 +85,50 @@ def test_one_wrong_step_is_no_way_that_the_registration_lost(tunnel: CloudScans,
     assert steps_off_m(consistent.odom_T_sensor, true).max() < 0.06
 
 
+@pytest.mark.parametrize("turn_deg", [58.0, 90.0, 120.0])
+def test_one_wrong_turn_is_found_though_the_scans_behind_it_agree(tunnel: CloudScans, turn_deg: float) -> None:
+    true = tunnel.odom_T_sensor
+    turned = true.copy()
+    turned[24:] = turned[23] @ yaw_pose(np.deg2rad(turn_deg), (0.5, 0.0, 0.0)) @ invert(true[23]) @ true[24:]
+    with pytest.warns(InputWarning, match="its way: the step from scan 23 to 24, beside the walls, found anew"):
+        consistent = make_consistent(with_poses(tunnel, turned))
+    assert steps_off_m(consistent.odom_T_sensor, true).max() < 0.06
+
+
+def test_a_lost_last_scan_is_found(tunnel: CloudScans) -> None:
+    true = tunnel.odom_T_sensor
+    with pytest.warns(InputWarning, match="its way: the step from scan 38 to 39, beside the walls, found anew"):
+        consistent = make_consistent(with_poses(tunnel, lost(true, N_SCANS - 1)))
+    assert steps_off_m(consistent.odom_T_sensor, true).max() < 0.06
+
+
+@pytest.mark.parametrize(("spacing_m", "n_scans"), [(2.0, 20), (4.0, 12)])
+def test_an_odometry_is_not_lost_because_rings_lie_on_rings(spacing_m: float, n_scans: int) -> None:
+    """Eight beams, as an OS0-8 has: the rings of two scans lie on one another best where the sensor stands."""
+    rng = np.random.default_rng(0)
+    waves = rng.uniform((0.3, 1.0, 0.0), (3.0, 6.0, 2 * np.pi), (12, 3))
+    true = make_pose(translation=np.column_stack([np.arange(n_scans) * spacing_m, np.zeros((n_scans, 2))]))
+    turn, rise = np.meshgrid(np.arange(512) / 512 * 2 * np.pi, np.deg2rad(np.linspace(-45, 45, 8)))
+    ray = np.stack([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)], axis=-1).reshape(-1, 3)
+    around = np.arctan2(ray[:, 2], ray[:, 1])
+
+    def seen(along_m: float) -> Float64Array:
+        range_m = np.full(len(ray), 5.0)
+        for _ in range(8):  # walls at 5 m, a floor 1.5 m below, 0.15 m rough
+            at_m = along_m + range_m * ray[:, 0]
+            rough_m = sum(0.15 * np.sin(k * at_m + np.round(m) * around + p) for k, m, p in waves) / np.sqrt(12)
+            with np.errstate(divide="ignore"):
+                floor_m = (1.5 + 0.3 * rough_m) / np.abs(ray[:, 2])
+                across_m, roof_m = ((5.0 + rough_m) / np.abs(ray[:, axis]) for axis in (1, 2))
+            range_m = np.minimum(np.minimum(across_m, np.where(ray[:, 2] < 0, floor_m, roof_m)), 70.0)
+        is_near = range_m < 60.0
+        return ray[is_near] * (range_m[is_near] + rng.normal(0, 0.01, np.count_nonzero(is_near)))[:, None]
+
+    recorded = true @ make_pose(translation=rng.normal(0, 0.03, (n_scans, 3)))
+    consistent = make_consistent(CloudScans("rings", recorded, [seen(x) for x in true[:, 0, 3]]))
+    assert steps_off_m(consistent.odom_T_sensor, true).max() < 0.2
+
+
 @pytest.mark.parametrize(("spacing_m", "loose"), [(2.5, 0.2), (3.0, 0.15), (3.0, 0.3)])
 def test_loose_points_make_no_scan_lost(spacing_m: float, loose: float) -> None:
     """In a smooth drift with posts more points of a scan overlap with those of a scan nearby, wrong as the place is."""

@@ -213,3 +213,27 @@ def test_the_rigid_merge_fits_where_the_odometry_kept_its_way(
     told = report_as_recorded(report, before, after)
     off = invert(report.before_T_after) @ told.before_T_after
     assert np.linalg.norm(off[:3, 3]) < 0.3
+
+
+@pytest.mark.parametrize("refine", ["none", "checked"])
+@pytest.mark.parametrize("is_before", [True, False])
+def test_a_known_merge_holds_where_an_odometry_lost_its_way(
+    tunnel_before: MappedSession,
+    tunnel_after: MappedSession,
+    true_before_T_after: Float64Array,
+    refine: str,
+    is_before: bool,
+) -> None:
+    def spun(session: MappedSession, share: float) -> MappedSession:
+        recorded = session.map.odom_T_sensor.copy()
+        for number in range(int(len(recorded) * (1 - share)), len(recorded)):
+            recorded[number] = recorded[number - 1] @ yaw_pose(np.deg2rad(58.0), (4.5, 0.5, 0.1))
+        return replace(session, map=replace(session.map, recorded_T_sensor=recorded))
+
+    before, after = spun(tunnel_before, 0.3 * is_before), spun(tunnel_after, 0.3 * (not is_before))
+    config = MergeConfig(voxel_m=0.25, refine=refine)
+    merged = take_known_merge(before, after, true_before_T_after, config)
+    places = tunnel_after.map.odom_T_keyframe[:, :3, 3]  # the maps are the mended ones
+    assert merged.local is not None
+    off_m = np.linalg.norm(merged.local.to_map(places) - transform(true_before_T_after, places), axis=1)
+    assert off_m.max() < 0.05
