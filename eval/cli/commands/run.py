@@ -180,6 +180,11 @@ def score(
         raise InputError(f"{folder}: an answer; its pair comes first: `tunnelcd score {answer or 'PAIR'} {folder}`")
     if answer is None and (folder / "truth" / "changes.json").is_file():
         raise InputError(f"{folder}: a pair of sessions; name an answer to it, too: `tunnelcd score {folder} ANSWER`")
+    if answer is not None and (folder / "provenance.json").is_file() and (folder / "pairs").is_dir():
+        raise InputError(
+            f"{folder}: a run, no pair: name a pair below {folder / 'pairs'}; answers to all of its pairs go by "
+            f"`tunnelcd score {folder} --predictions DIR --as NAME`"
+        )
     if answer is not None:
         if predictions is not None:
             raise InputError("--predictions: goes with a run folder alone, not with one pair and its answer")

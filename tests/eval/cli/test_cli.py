@@ -224,6 +224,10 @@ def test_score_with_swapped_or_missing_folders_says_the_order(tmp_path: Path, co
     pair, mine = tmp_path / "pair", tmp_path / "mine"
     assert_refused(command("score", mine, pair), f"an answer; its pair comes first: `tunnelcd score {pair} {mine}`")
     assert_refused(command("score", pair), f"name an answer to it, too: `tunnelcd score {pair} ANSWER`")
+    run = tmp_path / "run"
+    (run / "pairs").mkdir(parents=True)
+    (run / "provenance.json").write_text("{}")
+    assert_refused(command("score", run, mine), f"a run, no pair: name a pair below {run / 'pairs'}")
 
 
 def test_score_of_one_answer(pair: Path, tmp_path: Path, command: Command) -> None:
