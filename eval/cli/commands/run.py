@@ -171,23 +171,9 @@ def score(
     quiet: Quiet = False,
 ) -> None:
     """Score stored answers against the truth again, or the answers of another program; no method is run."""
-    from cdpipe.core.errors import InputError
-
     require_json_file(out)
-    if (predictions is None) != (name is None):
-        raise InputError("--predictions and --as: a run takes predictions under a name: give both, or neither")
-    if (folder / "answer.json").is_file() and answer != folder:
-        raise InputError(f"{folder}: an answer; its pair comes first: `tunnelcd score {answer or 'PAIR'} {folder}`")
-    if answer is None and (folder / "truth" / "changes.json").is_file():
-        raise InputError(f"{folder}: a pair of sessions; name an answer to it, too: `tunnelcd score {folder} ANSWER`")
-    if answer is not None and (folder / "provenance.json").is_file() and (folder / "pairs").is_dir():
-        raise InputError(
-            f"{folder}: a run, no pair: name a pair below {folder / 'pairs'}; answers to all of its pairs go by "
-            f"`tunnelcd score {folder} --predictions DIR --as NAME`"
-        )
+    _require_scorable(folder, answer, predictions, name)
     if answer is not None:
-        if predictions is not None:
-            raise InputError("--predictions: goes with a run folder alone, not with one pair and its answer")
         from eval.running.scaling.remaking import remade_below
         from eval.scoring.scoring import score
 
@@ -218,6 +204,29 @@ def score(
     else:
         print_summary(run.path)
     say(quiet, f"{folder}: {n_scored} {told}, tables rewritten")
+
+
+def _require_scorable(folder: Path, answer: Path | None, predictions: Path | None, name: str | None) -> None:
+    """Refuse what `score` cannot take together.
+
+    Raises:
+        InputError: One line with what to give instead.
+    """
+    from cdpipe.core.errors import InputError
+
+    if (predictions is None) != (name is None):
+        raise InputError("--predictions and --as: a run takes predictions under a name: give both, or neither")
+    if (folder / "answer.json").is_file() and answer != folder:
+        raise InputError(f"{folder}: an answer; its pair comes first: `tunnelcd score {answer or 'PAIR'} {folder}`")
+    if answer is None and (folder / "truth" / "changes.json").is_file():
+        raise InputError(f"{folder}: a pair of sessions; name an answer to it, too: `tunnelcd score {folder} ANSWER`")
+    if answer is not None and (folder / "provenance.json").is_file() and (folder / "pairs").is_dir():
+        raise InputError(
+            f"{folder}: a run, no pair: name a pair below {folder / 'pairs'}; answers to all of its pairs go by "
+            f"`tunnelcd score {folder} --predictions DIR --as NAME`"
+        )
+    if answer is not None and predictions is not None:
+        raise InputError("--predictions: goes with a run folder alone, not with one pair and its answer")
 
 
 def export(
