@@ -218,7 +218,7 @@ def _check_places(report: ChangeReport, sessions: Mapping[SessionName, SessionTr
             points = scoring_points.points_odom[rows].astype(np.float64)
             if item.session == "after":
                 points = transform_each(merge_at_scans(report, scoring_points.scans(rows)), points)
-            # a tree of many equal points takes minutes
+            # every search would look at all of many equal points
             distances_m[index] = np.asarray(cKDTree(np.unique(item.points_map, axis=0)).query(points)[0])
     far = [index for index, each in distances_m.items() if np.mean(each <= _BESIDE_M) < _MIN_BESIDE]
     if not far or 2 * len(far) < len(distances_m):

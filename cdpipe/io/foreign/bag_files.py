@@ -236,8 +236,8 @@ def _bag(path: str) -> Iterator[Any]:
         raise InputError(f"{path}: a bag needs a package more: pip install 'tunnelcd[formats]'") from error
     with _tells(path), tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = find_paths(Path(path), Path(folder))
-        with _tells(path, _WAYS_OUT.get(found[0].suffix.lower(), "") if found else ""):
+        with _tells(path, _way_out(Path(path))):
+            found = find_paths(Path(path), Path(folder))
             reader = AnyReader(found, default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             reader.open()
         with closing(reader) as bag:
@@ -246,9 +246,19 @@ def _bag(path: str) -> Iterator[Any]:
             yield bag
 
 
+def _way_out(path: Path) -> str:
+    """Return what mends a bag that was cut short, "" where its kind is not known."""
+    named = [path] if path.is_file() else list(path.iterdir()) if path.is_dir() else []
+    ways = {_WAYS_OUT[file.suffix.lower()] for file in named if file.suffix.lower() in _WAYS_OUT}
+    return ways.pop() if len(ways) == 1 else ""
+
+
 @contextmanager
 def _tells(path: str, way_out: str = "") -> Iterator[None]:
-    """Let what a damaged bag provokes become one `InputError`, with the way out at its end."""
+    """Let what a damaged bag provokes become one `InputError`.
+
+    The way out stands at its end, unless it is an error of ours (`ValueError`), which says its own.
+    """
     try:
         yield
     except InputError:
@@ -257,7 +267,8 @@ def _tells(path: str, way_out: str = "") -> Iterator[None]:
         if not isinstance(error, _ERRORS) and type(error).__module__.split(".")[0] not in _LIBRARIES:
             raise
         told = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: not a readable bag: {told[:300]}{way_out}") from error
+        end = "" if isinstance(error, ValueError) else way_out
+        raise InputError(f"{path}: not a readable bag: {told[:300]}{end}") from error
 
 
 def _keep_chunks_at_0(bag: Any) -> None:

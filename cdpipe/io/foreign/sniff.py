@@ -121,8 +121,7 @@ def _formats_in(folder: Path) -> dict[str, int]:
 
 def _guess_folder(folder: Path) -> str:
     found = _formats_in(folder)
-    has_scans = found.keys() - {"ply"} or {each.name for each in find_scans(folder, "ply")} - _OF_AN_ANSWER
-    if (folder / "answer.json").is_file() and not has_scans:
+    if not found and (folder / "answer.json").is_file():
         raise InputError(f"{folder}: an answer, no session: name the session that it was made from")
     if len(found) > 1:
         told = ", ".join(f"{count} {name}" for name, count in found.items())
@@ -150,14 +149,16 @@ def _tell_content(folder: Path) -> str:
 
 
 def _files(folder: Path, suffixes: Iterable[str]) -> list[Path]:
+    """Return the files of a folder with some suffixes, without those of an answer that lies there."""
     if not folder.is_dir():
         return []
     wanted = set(suffixes)
+    left_out = _OF_AN_ANSWER if (folder / "answer.json").is_file() else set()
     found = []
     for number, file in enumerate(folder.iterdir()):
         if number >= _MOST_FILES:
             raise InputError(f"{folder}: more than {_MOST_FILES} files: split it")
-        if file.suffix.lower() in wanted and not file.name.startswith("."):
+        if file.suffix.lower() in wanted and not file.name.startswith(".") and file.name not in left_out:
             found.append(file)
     return found
 

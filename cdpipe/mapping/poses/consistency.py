@@ -43,12 +43,14 @@ _JUMP_M = 0.15
 # There is one, too, if so many more of its points are off the walls than of the median block's: at jumps of 1 to 2.5 m
 # and turns of 58 to 180 degrees 0.29 and more, elsewhere 0.05 at most.
 _BESIDE_SHARE = 0.2
+_MOST_SHARE = 0.5  # a scan with a smaller share of the points of the median one does not tell
 # Least share of the recorded way, block by block, that a registration keeps. Five scans each of an OS0-8 on a driving
 # car, which lock onto their rings, keep 0.16 and 0.22.
 _LEAST_WAY = 0.8
-# The sensor stands at the steps that seem wrong if their median is as short as this, and this share of the odometry's:
-# an OS0-8 that locks onto its rings moves by 0.00 to 0.06 m from scan to scan where it drives 0.5 to 4 m.
-_STANDS_M, _STANDS_SHARE = 0.03, 0.1
+# Rings hold the sensor at the steps that seem wrong if the median of these is as short as this (an OS0-8's is 0.00 to
+# 0.02 m where it drives 0.5 to 4 m), and if by the odometry they are at most so many times as long as its other steps
+# (in a spin or a jump they are ten times as long).
+_STANDS_M, _USUAL_STEPS = 0.03, 2.0
 _ROUNDING = 1e-9  # of an interpolated percentile
 # A scan is bent if so many of its points are off the walls, and so many times as many as of the scans around it.
 _BENT_SHARE, _BENT_FACTOR = 0.05, 3.0
@@ -118,9 +120,8 @@ def make_consistent(
         told.begin()
         followed, is_wrong = follow(scans, told.add)
         is_kept = _slides(scans, followed, is_wrong)
-        if is_kept:
-            scans.restore()
-        elif is_wrong.any():
+        scans.restore()
+        if not is_kept and is_wrong.any():
             mended = mend_odometry(scans, followed, is_wrong)
             _warn_of_lost(source, is_wrong)
     if not is_kept:
@@ -176,7 +177,8 @@ def _has_jump(scans: Samples, poses: Float64Array) -> bool:
         found = register_scan(scans.of_scan(end - 1), last, [last], target, FOLLOWING)
         if moved_m(last[None], found.pose[None])[0] > _JUMP_M:
             return True
-        misfits.append(found.misfit)
+        if scans.n_points[end - 1] >= _MOST_SHARE * np.median(scans.n_points):
+            misfits.append(found.misfit)
     usual = np.percentile(misfits, 50, method="lower") if misfits else 0.0
     return max(misfits, default=0.0) > usual + _BESIDE_SHARE
 
@@ -187,11 +189,12 @@ def _slides(scans: Samples, poses: Float64Array, is_wrong: BoolArray) -> bool:
     Few beams, or scans far apart, meet the ground in rings around the sensor. Where these hold a registration, the
     sensor seems to stand: in whole blocks, or at the steps of the odometry (S - 1,) that seem wrong then.
     """
-    steps_m, odometry_m = (
-        np.linalg.norm(np.diff(each[:, :3, 3], axis=0), axis=1)[is_wrong] for each in (poses, scans.odometry)
-    )
-    if is_wrong.any() and np.median(steps_m) < min(_STANDS_M, _STANDS_SHARE * np.median(odometry_m)):
-        return True
+    steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    if is_wrong.any() and np.median(steps_m[is_wrong]) < _STANDS_M:
+        odometry_m = moved_m(scans.odometry[:-1], scans.odometry[1:])
+        usual_m = np.inf if is_wrong.all() else np.median(odometry_m[~is_wrong])
+        if np.median(odometry_m[is_wrong]) < _USUAL_STEPS * usual_m:
+            return True
     ends = np.append(np.unique(np.floor(scans.path_m / _BLOCK_M), return_index=True)[1], len(poses) - 1)
     way_m, recorded_m = (np.linalg.norm(np.diff(each[ends, :3, 3], axis=0), axis=1) for each in (poses, scans.odometry))
     n_wrong = np.diff(np.append(0, np.cumsum(is_wrong))[ends])

@@ -76,10 +76,26 @@ def _stretches(recorded_T_keyframe: Float64Array, odom_T_keyframe: Float64Array)
     return np.append(0, np.cumsum(moved_m(recorded, mapped) > _LEAP_M))
 
 
-def _longest_stretch(point_map: PointMap) -> Int64Array:
-    """Return the (N,) keyframes of the longest stretch in which the recorded odometry did not lose its way."""
-    stretches = _stretches(_recorded_T_keyframe(point_map), point_map.odom_T_keyframe)
-    return np.flatnonzero(stretches == np.argmax(np.bincount(stretches)))
+def _known_stretch(
+    recorded_T_keyframe: Float64Array, before: PointMap, after: PointMap
+) -> tuple[Int64Array, Int64Array]:
+    """Return the before and the after keyframes of the two stretches that a known merge is of.
+
+    They are those under which most after keyframes lie beside before keyframes, the first ones of several.
+
+    Args:
+        recorded_T_keyframe: (Ka, 4, 4) recorded poses of the after keyframes, as the merge places them.
+        before: The before map.
+        after: The after map.
+    """
+    of_before, of_after = (_stretches(_recorded_T_keyframe(each), each.odom_T_keyframe) for each in (before, after))
+    path = cKDTree(_recorded_T_keyframe(before)[:, :3, 3])
+    gaps_m, nearest = map(np.asarray, path.query(recorded_T_keyframe[:, :3, 3]))
+    shared = gaps_m <= max(_SHARED_M, gaps_m.min())
+    pairs = np.column_stack([of_before[nearest], of_after])[shared]
+    found, n_shared = np.unique(pairs, axis=0, return_counts=True)
+    stretch_before, stretch_after = found[np.argmax(n_shared)]
+    return np.flatnonzero(of_before == stretch_before), np.flatnonzero(of_after == stretch_after)
 
 
 def regions_as_mapped(regions: ChangeRegions, before: PointMap) -> ChangeRegions:
@@ -95,13 +111,13 @@ def merge_as_mapped(before_T_after: Float64Array, before: PointMap, after: Point
     """Return a (4, 4) merge of the recorded frames as an alignment of two maps with consistent poses.
 
     What an after keyframe saw lands where the merge puts it. The alignment is the merge itself where both maps have the
-    recorded poses. Where an odometry lost its way, the merge is that of the longest stretch, and what lies outside of
-    it has the alignment of its end.
+    recorded poses. Where an odometry lost its way, the merge is that of the longest stretch under which both sessions
+    were in one place, and what lies outside of it has the alignment of its end.
     """
     if _is_as_recorded(before) and _is_as_recorded(after):
         return PathAlignment.rigid(before_T_after)
     recorded_T_keyframe, odom_T_keyframe = before_T_after @ _recorded_T_keyframe(after), after.odom_T_keyframe
-    known, kept = (_longest_stretch(each) for each in (before, after))
+    known, kept = _known_stretch(recorded_T_keyframe, before, after)
     map_T_recorded = _transforms_at(
         recorded_T_keyframe[:, :3, 3], _recorded_T_keyframe(before)[known], before.odom_T_keyframe[known]
     )

@@ -111,6 +111,11 @@ class Samples:
         self.motion = _motion(self.odometry, times_ns)
         self._replaced: dict[int, list[Float32Array]] = {}
 
+    @property
+    def n_points(self) -> Int64Array:
+        """(S,) how many points of each scan are registered."""
+        return np.diff(self._offsets[:, 1])
+
     def mend(self, odometry: Float64Array) -> None:
         """Take other (S, 4, 4) poses for those of the odometry."""
         self.odometry, self.path_m = odometry, travelled_m(odometry)

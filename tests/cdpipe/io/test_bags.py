@@ -135,6 +135,18 @@ def test_a_bag_that_is_none_says_so(tmp_path: Path) -> None:
     assert "if it was cut short, `rosbag reindex FILE`" in said(tmp_path / "cut.bag")
 
 
+@pytest.mark.parametrize(("suffix", "told"), [(".mcap", "mcap recover"), (".db3", "sqlite3 FILE .recover")])
+def test_a_cut_bag_of_ros_2_names_what_mends_it(tmp_path: Path, suffix: str, told: str) -> None:
+    if suffix == ".mcap":
+        pytest.importorskip("mcap")
+        whole = write_bag(tmp_path / "whole.mcap", MADE)
+    else:
+        whole = next(write_bag(tmp_path / "whole", MADE).glob("*.db3"))
+    cut = tmp_path / f"cut{suffix}"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    assert "cut" in said(cut) and f"if it was cut short, `{told}" in said(cut)
+
+
 def test_topics_and_poses_that_a_bag_lacks_are_listed(tmp_path: Path) -> None:
     bare = write_bag(tmp_path / "bare.bag", MADE, "none")
     text = said(bare)

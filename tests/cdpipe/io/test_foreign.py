@@ -19,6 +19,7 @@ from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.io.foreign import HowToRead, convert_recording, folder_of_options, guess_format
 from cdpipe.io.foreign.clouds import point_times, stamps_of_names
 from cdpipe.io.foreign.points_files import read_e57
+from cdpipe.io.foreign.sniff import find_scans
 from cdpipe.io.out.kitti import write_kitti as write_kitti_out
 from cdpipe.io.out.scans import Outgoing
 from cdpipe.io.ply import read_ply
@@ -266,6 +267,7 @@ def test_a_pair_and_an_answer_are_told_from_a_session(tmp_path: Path) -> None:
     # an answer that was saved beside scans, or into a session
     (tmp_path / "answer" / "000000.ply").write_text("")
     assert guess_format(tmp_path / "answer") == "ply"
+    assert [each.name for each in find_scans(tmp_path / "answer", "ply")] == ["000000.ply"]
     (tmp_path / "answer" / "session.json").write_text("{}")
     assert guess_format(tmp_path / "answer") == "session"
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.errors import InputWarning
-from cdpipe.core.geometry import Float64Array, invert, make_pose, transform_each, yaw_pose
+from cdpipe.core.geometry import Float64Array, invert, make_pose, transform, transform_each, travelled_m, yaw_pose
 from cdpipe.core.geometry.motion import Motion
 from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.poses.consistency import make_consistent
@@ -15,7 +15,7 @@ from cdpipe.mapping.poses.following import follow
 from cdpipe.mapping.poses.scan_registration import Registered, Samples, motion_through
 from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PosedScan
-from tests.cdpipe.conftest import CloudScans, scanned
+from tests.cdpipe.conftest import CloudScans, scanned, tunnel_points
 
 N_SCANS, LOST_AT, SCAN_S = 40, 28, 0.5
 SPIN = yaw_pose(np.deg2rad(70.0), (1.5, 0.5, 0.1))
@@ -100,6 +100,33 @@ def test_a_lost_last_scan_is_found(tunnel: CloudScans) -> None:
     with pytest.warns(InputWarning, match="its way: the step from scan 38 to 39, beside the walls, found anew"):
         consistent = make_consistent(with_poses(tunnel, lost(true, N_SCANS - 1)))
     assert steps_off_m(consistent.odom_T_sensor, true).max() < 0.06
+
+
+@pytest.mark.parametrize("n_wrong", [12, 1])
+def test_an_odometry_is_lost_though_the_sensor_stands(n_wrong: int) -> None:
+    drive, points, rng = scanned("drive", make_pose(), 0, 1, []), tunnel_points(0, 1), np.random.default_rng(0)
+    true = drive.odom_T_sensor[[*range(28), *[27] * 12]]
+    clouds = []
+    for pose in true:
+        near = points[np.linalg.norm(points - pose[:3, 3], axis=1) < 12.0]
+        clouds.append(transform(invert(pose), rng.choice(near, 6000, replace=False) + rng.normal(0, 0.005, (6000, 3))))
+    recorded = lost(true, 28)
+    if n_wrong == 1:  # a jump at the stand
+        recorded = true.copy()
+        recorded[34:, 0, 3] += 3.0
+    with pytest.warns(InputWarning, match="12 of 39 steps" if n_wrong > 1 else "the step from scan 33 to 34"):
+        consistent = make_consistent(CloudScans("standing", recorded, clouds))
+    assert steps_off_m(consistent.odom_T_sensor, true).max() < 0.06
+
+
+@pytest.mark.parametrize("n_points", [0, 20])
+def test_a_scan_of_few_points_is_no_jump(tunnel: CloudScans, n_points: int) -> None:
+    clouds = [tunnel.scan(index).points_sensor for index in range(N_SCANS)]
+    path_m = travelled_m(tunnel.odom_T_sensor)
+    last = int(np.flatnonzero(np.diff(np.floor(path_m / 4.0)))[2])  # of the third block
+    clouds[last] = clouds[last][:n_points]
+    consistent = make_consistent(CloudScans("dropped", tunnel.odom_T_sensor, clouds))
+    np.testing.assert_array_equal(consistent.odom_T_sensor, tunnel.odom_T_sensor)
 
 
 @pytest.mark.parametrize(("spacing_m", "n_scans"), [(2.0, 20), (4.0, 12)])

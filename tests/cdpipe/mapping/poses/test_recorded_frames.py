@@ -237,3 +237,23 @@ def test_a_known_merge_holds_where_an_odometry_lost_its_way(
     assert merged.local is not None
     off_m = np.linalg.norm(merged.local.to_map(places) - transform(true_before_T_after, places), axis=1)
     assert off_m.max() < 0.05
+
+
+@pytest.mark.parametrize(("at", "is_of_the_end"), [(0.65, True), (0.3, False)])
+def test_a_known_merge_is_one_of_the_stretch_under_which_the_sessions_met(
+    tunnel_before: MappedSession, tunnel_after: MappedSession, true_before_T_after: Float64Array, at: float,
+    is_of_the_end: bool,
+) -> None:  # fmt: skip
+    """The before odometry jumps aside by 8 m; the merge is true before the jump, or behind it."""
+    mapped, first = tunnel_before.map.odom_T_sensor, int(len(tunnel_before.map.odom_T_sensor) * at)
+    recorded = mapped.copy()
+    recorded[first:, 1, 3] += 8.0
+    before, known, keyframes = replace(tunnel_before.map, recorded_T_sensor=recorded), true_before_T_after, slice(None)
+    if is_of_the_end:  # the after session saw only what lies behind
+        known = make_pose(translation=(0.0, 8.0, 0.0)) @ known
+        along_m = transform(true_before_T_after, tunnel_after.map.odom_T_keyframe[:, :3, 3])[:, 0]
+        keyframes = np.flatnonzero(along_m > mapped[first, 0, 3] + 2.0)
+    after = replace(tunnel_after.map, keyframe_scans=tunnel_after.map.keyframe_scans[keyframes], views=None)
+    places = after.odom_T_keyframe[:, :3, 3]
+    found = merge_as_mapped(known, before, after)
+    np.testing.assert_allclose(found.to_map(places), transform(true_before_T_after, places), atol=1e-6)
