@@ -257,7 +257,7 @@ def _way_out(path: Path) -> str:
 def _tells(path: str, way_out: str = "") -> Iterator[None]:
     """Let what a damaged bag provokes become one `InputError`.
 
-    The way out stands at its end, unless it is an error of ours (`ValueError`), which says its own.
+    The way out stands at its end where the library could not read the bag; errors of ours (`ValueError`) say their own.
     """
     try:
         yield
@@ -267,7 +267,8 @@ def _tells(path: str, way_out: str = "") -> Iterator[None]:
         if not isinstance(error, _ERRORS) and type(error).__module__.split(".")[0] not in _LIBRARIES:
             raise
         told = " ".join(str(error).split()) or type(error).__name__
-        end = "" if isinstance(error, ValueError) else way_out
+        is_other = isinstance(error, (ValueError, OSError, LookupError)) or type(error).__module__.startswith("ruamel")
+        end = "" if is_other else way_out
         raise InputError(f"{path}: not a readable bag: {told[:300]}{end}") from error
 
 

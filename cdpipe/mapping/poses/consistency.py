@@ -23,6 +23,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputWarning
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, invert
@@ -47,10 +48,10 @@ _MOST_SHARE = 0.5  # a scan with a smaller share of the points of the median one
 # Least share of the recorded way, block by block, that a registration keeps. Five scans each of an OS0-8 on a driving
 # car, which lock onto their rings, keep 0.16 and 0.22.
 _LEAST_WAY = 0.8
-# Rings hold the sensor at the steps that seem wrong if the median of these is as short as this (an OS0-8's is 0.00 to
-# 0.02 m where it drives 0.5 to 4 m), and if by the odometry they are at most so many times as long as its other steps
-# (in a spin or a jump they are ten times as long).
-_STANDS_M, _USUAL_STEPS = 0.03, 2.0
+# Rings hold the sensor at the steps that seem wrong if most of these are as short as this, without a turn (an OS0-8's
+# are 0.00 to 0.06 m where it drives 0.5 to 4 m, the median 0.02 m), and if by the odometry they are at most so many
+# times as long as its other steps: those of a spin or a jump are longer.
+_STANDS_M, _STANDS_RAD, _USUAL_STEPS = 0.03, 0.1, 2.0
 _ROUNDING = 1e-9  # of an interpolated percentile
 # A scan is bent if so many of its points are off the walls, and so many times as many as of the scans around it.
 _BENT_SHARE, _BENT_FACTOR = 0.05, 3.0
@@ -189,8 +190,10 @@ def _slides(scans: Samples, poses: Float64Array, is_wrong: BoolArray) -> bool:
     Few beams, or scans far apart, meet the ground in rings around the sensor. Where these hold a registration, the
     sensor seems to stand: in whole blocks, or at the steps of the odometry (S - 1,) that seem wrong then.
     """
-    steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    if is_wrong.any() and np.median(steps_m[is_wrong]) < _STANDS_M:
+    steps = (invert(poses[:-1]) @ poses[1:])[is_wrong]
+    turns_rad = Rotation.from_matrix(steps[:, :3, :3]).magnitude() if len(steps) else np.zeros(0)
+    stands = (np.linalg.norm(steps[:, :3, 3], axis=1) < _STANDS_M) & (turns_rad < _STANDS_RAD)
+    if len(steps) and np.mean(stands) > 0.5:
         odometry_m = moved_m(scans.odometry[:-1], scans.odometry[1:])
         usual_m = np.inf if is_wrong.all() else np.median(odometry_m[~is_wrong])
         if np.median(odometry_m[is_wrong]) < _USUAL_STEPS * usual_m:

@@ -64,6 +64,15 @@ def steps_off_m(poses: Float64Array, true: Float64Array) -> Float64Array:
     return np.asarray(np.linalg.norm(errors[:, :3, 3], axis=1))
 
 
+def seen_from(true: Float64Array) -> list[Float64Array]:
+    """Six thousand points of the test tunnel within 12 m of each pose, sensor frame."""
+    points, rng, clouds = tunnel_points(0, 1), np.random.default_rng(0), []
+    for pose in true:
+        near = points[np.linalg.norm(points - pose[:3, 3], axis=1) < 12.0]
+        clouds.append(transform(invert(pose), rng.choice(near, 6000, replace=False) + rng.normal(0, 0.005, (6000, 3))))
+    return clouds
+
+
 @pytest.mark.parametrize("at", [8, 16, 20, 28])  # before the middle, at it, and behind it
 def test_an_odometry_that_spins_to_the_end_is_found_again(tunnel: CloudScans, at: int) -> None:
     true = tunnel.odom_T_sensor
@@ -103,19 +112,25 @@ def test_a_lost_last_scan_is_found(tunnel: CloudScans) -> None:
 
 
 @pytest.mark.parametrize("n_wrong", [12, 1])
-def test_an_odometry_is_lost_though_the_sensor_stands(n_wrong: int) -> None:
-    drive, points, rng = scanned("drive", make_pose(), 0, 1, []), tunnel_points(0, 1), np.random.default_rng(0)
-    true = drive.odom_T_sensor[[*range(28), *[27] * 12]]
-    clouds = []
-    for pose in true:
-        near = points[np.linalg.norm(points - pose[:3, 3], axis=1) < 12.0]
-        clouds.append(transform(invert(pose), rng.choice(near, 6000, replace=False) + rng.normal(0, 0.005, (6000, 3))))
+def test_an_odometry_is_lost_though_the_sensor_stands(tunnel: CloudScans, n_wrong: int) -> None:
+    true = tunnel.odom_T_sensor[[*range(28), *[27] * 12]]
     recorded = lost(true, 28)
     if n_wrong == 1:  # a jump at the stand
         recorded = true.copy()
         recorded[34:, 0, 3] += 3.0
     with pytest.warns(InputWarning, match="12 of 39 steps" if n_wrong > 1 else "the step from scan 33 to 34"):
-        consistent = make_consistent(CloudScans("standing", recorded, clouds))
+        consistent = make_consistent(CloudScans("standing", recorded, seen_from(true)))
+    assert steps_off_m(consistent.odom_T_sensor, true).max() < 0.06
+
+
+@pytest.mark.parametrize("missed_m", [0.0, 0.5])
+def test_a_turn_on_the_spot_that_the_odometry_misses_is_found(tunnel: CloudScans, missed_m: float) -> None:
+    ahead = tunnel.odom_T_sensor[:18]
+    true = np.concatenate([ahead, ahead[::-1] @ yaw_pose(np.deg2rad(90.0), (0.0, 0.0, 0.0))])
+    recorded = true.copy()
+    recorded[18:] = ahead[-1] @ make_pose(translation=(missed_m, 0.0, 0.0)) @ invert(true[18]) @ true[18:]
+    with pytest.warns(InputWarning, match="its way: the step from scan 17 to 18"):
+        consistent = make_consistent(CloudScans("turning", recorded, seen_from(true)))
     assert steps_off_m(consistent.odom_T_sensor, true).max() < 0.06
 
 
