@@ -216,6 +216,8 @@ def _require_scorable(folder: Path, answer: Path | None, predictions: Path | Non
 
     if (predictions is None) != (name is None):
         raise InputError("--predictions and --as: a run takes predictions under a name: give both, or neither")
+    if answer is not None and predictions is not None:
+        raise InputError("--predictions: goes with a run folder alone, not with one pair and its answer")
     if (folder / "answer.json").is_file() and answer != folder:
         raise InputError(f"{folder}: an answer; its pair comes first: `tunnelcd score {answer or 'PAIR'} {folder}`")
     if answer is None and (folder / "truth" / "changes.json").is_file():
@@ -225,8 +227,6 @@ def _require_scorable(folder: Path, answer: Path | None, predictions: Path | Non
             f"{folder}: a run, no pair: name a pair below {folder / 'pairs'}; answers to all of its pairs go by "
             f"`tunnelcd score {folder} --predictions DIR --as NAME`"
         )
-    if answer is not None and predictions is not None:
-        raise InputError("--predictions: goes with a run folder alone, not with one pair and its answer")
 
 
 def export(
