@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cdpipe.core.geometry import Float64Array, Int64Array, fit_rigid, invert, transform_each
+from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, fit_rigid, invert, transform_each
 from cdpipe.mapping.poses.scan_registration import moved_m
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, SurfaceField
@@ -53,12 +53,10 @@ def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) 
     recorded_local = recorded @ map_T_keyframe @ invert(recorded_T_keyframe)
     before_T_after = report.before_T_after
     if len(scans) and not (_is_as_recorded(before) and _is_as_recorded(after)):
-        gaps_m, nearest = map(np.asarray, cKDTree(before.odom_T_keyframe[:, :3, 3]).query(map_T_keyframe[:, :3, 3]))
-        shared = gaps_m <= _SHARED_M if gaps_m.min() <= _SHARED_M else np.ones(len(scans), dtype=np.bool_)
         of_before = _stretches(_recorded_T_keyframe(before), before.odom_T_keyframe)
-        both = np.column_stack([of_before[nearest], _stretches(recorded_T_keyframe, odom_T_keyframe)])
-        _, stretch, n_shared = np.unique(both[shared], axis=0, return_inverse=True, return_counts=True)
-        shared[shared] = stretch.ravel() == np.argmax(n_shared)
+        of_after = _stretches(recorded_T_keyframe, odom_T_keyframe)
+        places = before.odom_T_keyframe[:, :3, 3], map_T_keyframe[:, :3, 3]
+        _, shared = _where_they_met(of_before, of_after, *places)
         before_T_after = fit_rigid(recorded_T_keyframe[shared, :3, 3], recorded_local[shared])
     return replace(
         report,
@@ -76,26 +74,27 @@ def _stretches(recorded_T_keyframe: Float64Array, odom_T_keyframe: Float64Array)
     return np.append(0, np.cumsum(moved_m(recorded, mapped) > _LEAP_M))
 
 
-def _known_stretch(
-    recorded_T_keyframe: Float64Array, before: PointMap, after: PointMap
-) -> tuple[Int64Array, Int64Array]:
-    """Return the before and the after keyframes of the two stretches that a known merge is of.
-
-    They are those under which most after keyframes lie beside before keyframes, the first ones of several.
+def _where_they_met(
+    of_before: Int64Array, of_after: Int64Array, before_places: Float64Array, after_places: Float64Array
+) -> tuple[Int64Array, BoolArray]:
+    """Return where both sessions were in one place, by keyframes that are aligned with one another.
 
     Args:
-        recorded_T_keyframe: (Ka, 4, 4) recorded poses of the after keyframes, as the merge places them.
-        before: The before map.
-        after: The after map.
+        of_before: (Kb,) stretch of each before keyframe.
+        of_after: (Ka,) stretch of each after keyframe.
+        before_places: (Kb, 3) positions of the before keyframes.
+        after_places: (Ka, 3) positions of the after keyframes.
+
+    Returns:
+        (Ka,) nearest before keyframe of each after keyframe, and (Ka,) whether it lies within 5 m (all do if none does)
+        in the two stretches of which most do, the first ones of several.
     """
-    of_before, of_after = (_stretches(_recorded_T_keyframe(each), each.odom_T_keyframe) for each in (before, after))
-    path = cKDTree(_recorded_T_keyframe(before)[:, :3, 3])
-    gaps_m, nearest = map(np.asarray, path.query(recorded_T_keyframe[:, :3, 3]))
-    shared = gaps_m <= max(_SHARED_M, gaps_m.min())
-    pairs = np.column_stack([of_before[nearest], of_after])[shared]
-    found, n_shared = np.unique(pairs, axis=0, return_counts=True)
-    stretch_before, stretch_after = found[np.argmax(n_shared)]
-    return np.flatnonzero(of_before == stretch_before), np.flatnonzero(of_after == stretch_after)
+    gaps_m, nearest = map(np.asarray, cKDTree(before_places).query(after_places))
+    shared = gaps_m <= _SHARED_M if gaps_m.min() <= _SHARED_M else np.ones(len(gaps_m), dtype=np.bool_)
+    both = np.column_stack([of_before[nearest], of_after])
+    _, stretch, n_shared = np.unique(both[shared], axis=0, return_inverse=True, return_counts=True)
+    shared[shared] = stretch.ravel() == np.argmax(n_shared)
+    return nearest, shared
 
 
 def regions_as_mapped(regions: ChangeRegions, before: PointMap) -> ChangeRegions:
@@ -117,13 +116,14 @@ def merge_as_mapped(before_T_after: Float64Array, before: PointMap, after: Point
     if _is_as_recorded(before) and _is_as_recorded(after):
         return PathAlignment.rigid(before_T_after)
     recorded_T_keyframe, odom_T_keyframe = before_T_after @ _recorded_T_keyframe(after), after.odom_T_keyframe
-    known, kept = _known_stretch(recorded_T_keyframe, before, after)
-    map_T_recorded = _transforms_at(
-        recorded_T_keyframe[:, :3, 3], _recorded_T_keyframe(before)[known], before.odom_T_keyframe[known]
-    )
+    places = _recorded_T_keyframe(before)[:, :3, 3], recorded_T_keyframe[:, :3, 3]
+    of_before, of_after = (_stretches(_recorded_T_keyframe(each), each.odom_T_keyframe) for each in (before, after))
+    nearest, shared = _where_they_met(of_before, of_after, *places)
+    known, kept = of_before == of_before[nearest[shared][0]], np.flatnonzero(of_after == of_after[shared][0])
+    map_T_recorded = _transforms_at(places[1], _recorded_T_keyframe(before)[known], before.odom_T_keyframe[known])
     local = map_T_recorded @ recorded_T_keyframe @ invert(odom_T_keyframe)
-    nearest = kept[np.searchsorted((kept[1:] + kept[:-1]) / 2, np.arange(len(local)))]
-    return PathAlignment(odom_T_keyframe[:, :3, 3], local[nearest])
+    own = kept[np.searchsorted((kept[1:] + kept[:-1]) / 2, np.arange(len(local)))]
+    return PathAlignment(odom_T_keyframe[:, :3, 3], local[own])
 
 
 def recorded_T_map(point_map: PointMap, places_odom: Float64Array) -> Float64Array:
