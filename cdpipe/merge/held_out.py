@@ -36,7 +36,7 @@ def choose_alignment(
     """Return the alignment that fits the held-out points better, place by place, and the evidence.
 
     Evidence: `n_judged` places, `n_kept` of them with the refined alignment, `rigid_misfit` and `refined_misfit`, the
-    mean over the places.
+    mean over the places; `n_beyond` places that fit better refined but farther away than the limit, if there is one.
 
     Args:
         before: The before map, indexed as a target.
@@ -66,7 +66,8 @@ def choose_alignment(
         ]
     )
     moved_m = np.linalg.norm(transform_each(refined, positions) - transform_each(given, positions), axis=1)
-    is_kept = _is_refined_better(misfits) & (moved_m[places] <= within_m)
+    is_better, is_near = _is_refined_better(misfits), moved_m[places] <= within_m
+    is_kept = is_better & is_near
     rigid_misfit, refined_misfit = misfits.mean(axis=0).tolist()
     evidence = {
         "n_judged": float(len(places)),
@@ -74,6 +75,8 @@ def choose_alignment(
         "rigid_misfit": rigid_misfit,
         "refined_misfit": refined_misfit,
     }
+    if np.isfinite(within_m):
+        evidence["n_beyond"] = float(np.count_nonzero(is_better & ~is_near))
     if not is_kept.any():
         return None, evidence
     return _blend(given, refined, np.interp(path_m, path_m[places], is_kept), positions), evidence

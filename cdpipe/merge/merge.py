@@ -141,7 +141,9 @@ def take_known_merge(
     walked = perf_counter()
     near_m = max(_KNOWN_M, _KNOWN_SHARE * float(travelled_m(after.map.odom_T_keyframe)[-1]))
     within_m = near_m if config.refine == "checked" else np.inf
-    _warn_of_misfit(found, by_user.at(maps[1].positions[found.walk.keyframes]), maps[1].positions, near_m, config)
+    is_told = _warn_of_misfit(
+        found, by_user.at(maps[1].positions[found.walk.keyframes]), maps[1].positions, near_m, config
+    )
     has_refinement = config.refine != "none" and not explain_rings(evidence)
     if has_refinement and "both_ways_m" in evidence:
         place = maps[1].positions[found.walk.keyframes[0]]
@@ -153,6 +155,13 @@ def take_known_merge(
         given = before_T_after if known_local is None else known_local.at(after.map.odom_T_keyframe[:, :3, 3])
         fitted, measured = refine(before.map, after.map, found.walk, given, config, within_m)
         evidence |= measured
+        n_beyond = int(measured.get("n_beyond", 0))
+        if n_beyond and not is_told:
+            text = (
+                f"known merge: {n_beyond} of {int(measured['n_judged'])} places fit more than {within_m:.1f} m beside "
+                "it, too far for drift: it holds there, and what is found there may be false"
+            )
+            warnings.warn(text, InputWarning, stacklevel=2)
         if fitted is not None:
             local, refined = fitted, fit_rigid(fitted.anchors_odom, fitted.before_T_after)
     seconds = {
@@ -165,8 +174,8 @@ def take_known_merge(
 
 def _warn_of_misfit(
     found: Hypothesis, known: Float64Array, positions: Float64Array, near_m: float, config: MergeConfig
-) -> None:
-    """Warn where the scans fit elsewhere than a known merge puts them, do not fit around it, or cannot tell.
+) -> bool:
+    """Warn, and return True, where scans fit elsewhere than a known merge has them or nowhere, or cannot tell.
 
     Args:
         found: The walk that started at the known merge.
@@ -188,10 +197,11 @@ def _warn_of_misfit(
         far_m = moved_m[moved_m > near_m]
         slides = not ratio >= config.min_hessian_ratio  # along a smooth drift
         if slides or len(far_m) == 0 or len(far_m) < max(min(2, len(moved_m)), _FAR_SHARE * len(moved_m)):
-            return
+            return False
         told = f"the scans fit {np.median(far_m):.1f} m beside it, at {len(far_m)} of {len(moved_m)} places"
     text = f"known merge: {told}: are both sessions in one frame? Without a known merge, it is searched for"
     warnings.warn(text, InputWarning, stacklevel=2)
+    return True
 
 
 def _require_reachable(before_T_after: Float64Array, before: PointMap, after: PointMap) -> None:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import Float64Array, Int64Array, require_poses
+from cdpipe.core.geometry import Float64Array, Int64Array, invert, require_poses
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.report import ChangeReport
+
+# Most by which odometry that holds errs between two keyframes, as where a recorded odometry is told to be lost.
+_LEAP_M = 1.0
 
 
 def alignment_of(report: ChangeReport, after_odom_T_sensor: Float64Array) -> PathAlignment:
@@ -50,3 +53,14 @@ def merge_at_scans(report: ChangeReport, scans: Int64Array) -> Float64Array:
     order = np.argsort(keyframes)
     between = (keyframes[order][1:] + keyframes[order][:-1]) / 2
     return np.asarray(local[order[np.searchsorted(between, scans)]])
+
+
+def is_torn(report: ChangeReport, after_odom_T_sensor: Float64Array) -> bool:
+    """Return whether the after odometry lost its way: between two keyframes it errs by a metre."""
+    scans, local = np.sort(report.keyframe_scans[1]), report.local_before_T_after
+    if local is None or len(scans) < 2:
+        return False
+    odom_T_keyframe = after_odom_T_sensor[scans]
+    map_T_keyframe = merge_at_scans(report, scans) @ odom_T_keyframe
+    recorded, found = (invert(each[:-1]) @ each[1:] for each in (odom_T_keyframe, map_T_keyframe))
+    return bool(np.any(np.linalg.norm(recorded[:, :3, 3] - found[:, :3, 3], axis=1) > _LEAP_M))

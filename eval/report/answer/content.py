@@ -17,9 +17,10 @@ from cdpipe.io.out.answer_map import require_own_keyframes
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.mapping import choose_keyframes
 from cdpipe.merge.coverage import measure_coverage
-from cdpipe.model.aligned import alignment_of
+from cdpipe.model.aligned import alignment_of, is_torn, merge_at_scans
+from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.report import ChangeReport
-from cdpipe.model.types import ScanSource
+from cdpipe.model.types import PosedScan, ScanSource, WrappedScans
 
 # Of each session: about so many scans along the path, returns within this range, and at most so many points.
 _SCANS, _REACH_M, MAX_POINTS = 120, 40.0, 120_000
@@ -80,13 +81,41 @@ def gather_content(
         require_own_keyframes(source, scans, report)
     if report.coverage is None:
         report = replace(report, coverage=measure_coverage(report, before.odom_T_sensor, after.odom_T_sensor))
-    alignment = alignment_of(report, after.odom_T_sensor)
+    alignment, path_after = alignment_of(report, after.odom_T_sensor), after.odom_T_sensor[:, :3, 3]
+    if is_torn(report, after.odom_T_sensor):  # its path lies over itself: no place of it has one place in the map
+        after = _Found(after, report)
+        alignment, path_after = PathAlignment.rigid(np.eye(4)), after.path
     (seen, cell_m), (seen_after, cell_after_m) = (
-        _thin_session(each, f"points {name}", on_stage) for each, name in zip(sessions, _WORDS, strict=True)
+        _thin_session(each, f"points {name}", on_stage) for each, name in zip((before, after), _WORDS, strict=True)
     )
     maps, cells_m = (seen, alignment.to_map(seen_after)), (cell_m, cell_after_m)
-    paths = before.odom_T_sensor[:, :3, 3], alignment.to_map(after.odom_T_sensor[:, :3, 3])
+    paths = before.odom_T_sensor[:, :3, 3], alignment.to_map(path_after)
     return AnswerContent((before.name, after.name), method, report, maps, cells_m, paths)
+
+
+class _Found(WrappedScans):
+    """The keyframes of a lost after session, in the map frame, where an answer found them anew."""
+
+    def __init__(self, source: ScanSource, report: ChangeReport) -> None:
+        super().__init__(source)
+        self._keyframes = np.sort(report.keyframe_scans[1])
+        self._poses = merge_at_scans(report, self._keyframes) @ source.odom_T_sensor[self._keyframes]
+
+    @property
+    def odom_T_sensor(self) -> Float64Array:
+        """(K, 4, 4) pose of each keyframe in the map frame."""
+        return self._poses
+
+    @property
+    def path(self) -> Float64Array:
+        """(S, 3) places of all scans, between keyframes on the line between theirs."""
+        scans = np.arange(len(self._source.odom_T_sensor))
+        return np.column_stack([np.interp(scans, self._keyframes, each) for each in self._poses[:, :3, 3].T])
+
+    def scan(self, index: int) -> PosedScan:
+        """Read one keyframe."""
+        found = self._source.scan(int(self._keyframes[index]))
+        return replace(found, odom_T_sensor=self._poses[index])
 
 
 _WORDS = ("before", "after")

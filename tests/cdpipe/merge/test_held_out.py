@@ -90,9 +90,11 @@ def test_what_fits_no_better_than_the_rigid_merge_is_not_kept(judge: Judge) -> N
 
 def test_no_place_moves_farther_than_it_may(judge: Judge) -> None:
     refined_m = np.zeros(judge.n)
-    assert judge.choose(refined_m, rigid_off_m=0.3, within_m=0.29)[0] is None
-    off_m, _ = judge.choose(refined_m, rigid_off_m=0.3, within_m=0.31)
-    assert off_m is not None
+    off_m, evidence = judge.choose(refined_m, rigid_off_m=0.3, within_m=0.29)
+    assert off_m is None and evidence["n_beyond"] == evidence["n_judged"] == len(judge.places)
+    off_m, evidence = judge.choose(refined_m, rigid_off_m=0.3, within_m=0.31)
+    assert off_m is not None and evidence["n_beyond"] == 0
+    assert "n_beyond" not in judge.choose(refined_m, rigid_off_m=0.3)[1]
     np.testing.assert_allclose(off_m, 0.0, atol=1e-9)
 
 

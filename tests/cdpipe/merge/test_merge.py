@@ -383,6 +383,23 @@ def test_a_known_merge_that_the_scans_contradict_is_told(
     assert told is None or re.match(f"known merge: .*{told}.*one frame", str(caught[0].message))
 
 
+@pytest.mark.parametrize(("end_off_m", "is_told"), [(0.9, False), (1.05, True)])
+def test_a_known_merge_that_is_off_at_the_end_of_the_path_alone_is_told(
+    tunnel_before: MappedSession,
+    tunnel_after: MappedSession,
+    true_before_T_after: Float64Array,
+    end_off_m: float,
+    is_told: bool,
+) -> None:
+    places = transform(true_before_T_after, tunnel_after.map.odom_T_keyframe[:, :3, 3])
+    turn = yaw_pose(end_off_m / float(np.linalg.norm(places[-1] - places[0])), (0.0, 0.0, 0.0))
+    around_start = make_pose(translation=places[0]) @ turn @ make_pose(translation=-places[0])
+    config = CONFIG.model_copy(update={"refine": "checked"})
+    told = pytest.warns(InputWarning, match=r"known merge: \d of \d+ places fit more than 1\.0 m beside it")
+    with told if is_told else nullcontext():
+        take_known_merge(tunnel_before, tunnel_after, around_start @ true_before_T_after, config)
+
+
 def test_a_right_known_merge_of_stations_that_lie_apart_is_told_to_be_unchecked() -> None:
     true = invert(AFTER_ODOM_T_WORLD)
     for apart_m, told in ((3.0, None), (5.5, "do not come within 5 m of each other under it, so it was not checked")):

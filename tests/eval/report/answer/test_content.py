@@ -5,13 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.geometry import invert, transform
+from cdpipe.core.geometry import invert, make_pose, transform
 from cdpipe.io.answer import write_answer, write_failure
 from cdpipe.io.readers import open_session
 from cdpipe.model.report import ChangedObject
-from eval.report.answer.content import MAX_POINTS, _thin_session, near_stretches, read_content
+from cdpipe.model.types import PosedScan, WrappedScans
+from eval.report.answer.content import MAX_POINTS, _thin_session, gather_content, near_stretches, read_content
 from tests.cdpipe.model.test_sentence import EMPTY
 
 
@@ -33,6 +35,41 @@ def test_both_sessions_are_in_the_map_frame(tiny_pair: Path, tiny_merge: np.ndar
     assert content.report.coverage.unseen_m == 0.0
     assert content.report.coverage.compared_m == pytest.approx(1.5 * 13)
     assert [step for step in steps if step[1] == step[2]] == [("points before", 14, 14), ("points after", 14, 14)]
+
+
+class Torn(WrappedScans):
+    """An after session with an odometry that jumps back to its start before scan 7."""
+
+    @property
+    def jump(self) -> np.ndarray:
+        places = super().odom_T_sensor[:, :3, 3]
+        return make_pose(translation=places[0] - places[7] + 0.1)
+
+    @property
+    def odom_T_sensor(self) -> np.ndarray:
+        poses = super().odom_T_sensor.copy()
+        poses[7:] = self.jump @ poses[7:]
+        return poses
+
+    def scan(self, index: int) -> PosedScan:
+        return replace(super().scan(index), odom_T_sensor=self.odom_T_sensor[index])
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_lost_after_session_lies_where_its_keyframes_were_found(
+    tiny_pair: Path, tiny_merge: np.ndarray, every: int
+) -> None:
+    before, after = (open_session(tiny_pair / name) for name in ("before", "after"))
+    keyframes, lost = np.arange(0, 14, every), Torn(after)
+    local = np.array([tiny_merge @ (np.eye(4) if scan < 7 else invert(lost.jump)) for scan in keyframes])
+    known = {"before_T_after": tiny_merge, "keyframe_scans": (np.arange(14), keyframes)}
+    whole = gather_content((before, after), "mine", replace(EMPTY, **known), lambda *_: None)
+    torn = replace(EMPTY, **known, local_before_T_after=local)
+    content = gather_content((before, lost), "mine", torn, lambda *_: None)
+    np.testing.assert_allclose(content.paths[1][: keyframes[-1]], whole.paths[1][: keyframes[-1]], atol=1e-6)
+    found, other = cKDTree(whole.maps[1]).query(content.maps[1])[0], cKDTree(content.maps[1]).query(whole.maps[1])[0]
+    assert found.max() < 0.2  # thinned on another grid
+    assert every > 1 or other.max() < 0.2
 
 
 def test_large_sessions_are_thinned_until_they_fit(tiny_pair: Path, monkeypatch: pytest.MonkeyPatch) -> None:
