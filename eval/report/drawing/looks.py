@@ -2,7 +2,7 @@
 
 No two known methods share colour and dash, and those of one dash can be told apart by the colour-blind (tested). The
 oracles, which are told the truth, are grey. A name that is not known gets one of the looks that no known method has,
-by a checksum of the name: the same name has the same look everywhere, and two such names may share one.
+by a checksum of the name and never black: the same name has the same look everywhere, and two such names may share one.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ _ORACLES: dict[str, tuple[Dash, str]] = {
     "oracle-merge+oracle-regions": ("dashdot", "diamond"),
 }  # fmt: skip
 _TAKEN = {(look.colour, look.dash) for look in KNOWN.values()}
-_FREE = [pair for pair in itertools.product(COLOURS, DASHES) if pair not in _TAKEN]
+_MARKED = {(look.colour, look.marker) for look in KNOWN.values()}
+# Black is ours alone: in a picture of points, without dashes, a stranger would pass for `tunnelcd`.
+_FREE = [pair for pair in itertools.product(COLOURS[1:], DASHES) if pair not in _TAKEN]
 
 
 def look_of(name: str) -> Look:
@@ -57,7 +59,8 @@ def look_of(name: str) -> Look:
     if name in KNOWN:
         return KNOWN[name]
     colour, free_dash = _FREE[_place(name, len(_FREE))]
-    return Look(colour, 1.2, free_dash, SYMBOLS[_place(name[::-1], len(SYMBOLS))], _SIZE_PT)
+    markers = [marker for marker in SYMBOLS if (colour, marker) not in _MARKED]
+    return Look(colour, 1.2, free_dash, markers[_place(name[::-1], len(markers))], _SIZE_PT)
 
 
 def line_of(name: str) -> Look:

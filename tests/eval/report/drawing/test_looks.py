@@ -61,5 +61,8 @@ def test_a_name_has_one_look_whatever_stands_beside_it() -> None:
     assert looks == [look_of(name) for name in reversed(names)][::-1]
     taken = {(look.colour, look.dash) for look in KNOWN.values()}
     assert all((look.colour, look.dash) not in taken and look.colour in COLOURS for look in looks)
+    marked = {(look.colour, look.marker) for look in KNOWN.values()}
+    assert all((look.colour, look.marker) not in marked for look in looks), "charts of points have no dash"
+    assert KNOWN["tunnelcd"].colour not in {look.colour for look in looks}
     assert len({(look.colour, look.dash, look.marker) for look in looks}) > 25
     assert line_of("mine").marker == "" and line_of("mine").colour == look_of("mine").colour
