@@ -32,8 +32,8 @@ class Target(Settings):
         at_least: The lower bound.
         at_most: The upper bound; exactly one of the two is set.
         method: Of which method, where it is not the one that the targets are about.
-        less: A rival whose value is subtracted first; for `recall_at_...` and `recall_at_..._proposed` of one domain,
-            and for the columns `surface_...` of surface_table.csv.
+        less: A rival whose value is subtracted first; for columns of one domain, and for the columns `surface_...` of
+            surface_table.csv.
         least_km: No verdict where the unchanged pairs are shorter than this together.
     """
 
@@ -58,10 +58,9 @@ class Target(Settings):
             raise ValueError("expected one of domain, site and sensor")
         if self.less_sensor and not self.sensor:
             raise ValueError("less_sensor: for a target with a sensor")
-        is_rate = self.domain is not None and self.column.startswith(RATE_COLUMN)
-        if self.less and not (is_rate or self.column.startswith(SURFACE_COLUMN)):
-            raise ValueError(f"less: for a column {RATE_COLUMN}... of one domain, or {SURFACE_COLUMN}...")
-        if self.odometry and (self.site or self.sensor or (self.less and is_rate)):
+        if self.less and self.domain is None and not self.column.startswith(SURFACE_COLUMN):
+            raise ValueError(f"less: for a column of one domain, or {SURFACE_COLUMN}...")
+        if self.odometry and (self.site or self.sensor or (self.less and self.column.startswith(RATE_COLUMN))):
             raise ValueError("odometry: for a column of a table, without site, sensor or a rate of a rival")
         return self
 

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from eval.core.statistics import interval_over_tunnels, mean_with_interval, median
-from eval.plans.targets import PROPOSED, RATE_COLUMN, SURFACE_COLUMN, Target, Targets
+from eval.plans.targets import PROPOSED, RATE_COLUMN, Target, Targets
 from eval.tables.conditions import ANY, by_condition, odometry_of, of_condition
 from eval.tables.regions.curves import RankedPairs, recall_difference
 from eval.tables.rows import numbers, records, texts, tunnel_numbers, tunnels_of
@@ -73,10 +73,10 @@ def judged_targets(
             found = _on_site(target, variant, own)
         elif target.sensor:
             found = _with_sensor(target, variant, results, main.odometry)
-        elif target.less and target.column.startswith(SURFACE_COLUMN):
-            found = _less_rival(target, variant, figures)
-        elif target.less:
+        elif target.less and target.column.startswith(RATE_COLUMN):
             found = _against(target, variant, ranked or {})
+        elif target.less:
+            found = _less_rival(target, variant, figures)
         else:
             found = _of_table(target, variant, figures)
         if found is None:

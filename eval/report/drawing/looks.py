@@ -8,6 +8,7 @@ by a checksum of the name and never black: the same name has the same look every
 from __future__ import annotations
 
 import itertools
+import re
 import zlib
 from dataclasses import replace
 
@@ -40,12 +41,18 @@ KNOWN = {
     "untrained": Look(_SKY, 1.2, "dashdot", "diamond", _SIZE_PT),
     "random-regions": Look(VERMILLION, 1.2, "dot", "x", _SIZE_PT),
 }
+# What measures the rock looks like the method of its name; ours like `tunnelcd`.
+_OF_SURFACE = {
+    "planes": KNOWN["tunnelcd"], "m3c2": KNOWN["m3c2"], "m3c2-ep": KNOWN["m3c2-ep"], "c2c": KNOWN["c2c"],
+    "c2m": Look(BLUE, 1.4, "longdash", "hexagon", _SIZE_PT), "unrolled": Look(_SKY, 1.6, "solid", "star", _SIZE_PT),
+}  # fmt: skip
+_SURFACE_METHOD = re.compile(r"\[(?:.*,)?surface\.method=([\w-]+)")
 _ORACLES: dict[str, tuple[Dash, str]] = {
     "oracle-merge": ("dash", "circle"), "oracle-regions": ("dot", "square"),
     "oracle-merge+oracle-regions": ("dashdot", "diamond"),
 }  # fmt: skip
-_TAKEN = {(look.colour, look.dash) for look in KNOWN.values()}
-_MARKED = {(look.colour, look.marker) for look in KNOWN.values()}
+_TAKEN = {(look.colour, look.dash) for look in (*KNOWN.values(), *_OF_SURFACE.values())}
+_MARKED = {(look.colour, look.marker) for look in (*KNOWN.values(), *_OF_SURFACE.values())}
 # Black is ours alone: in a picture of points, without dashes, a stranger would pass for `tunnelcd`.
 _FREE = [pair for pair in itertools.product(COLOURS[1:], DASHES) if pair not in _TAKEN]
 
@@ -58,6 +65,9 @@ def look_of(name: str) -> Look:
         return Look(GREY, 1.2, dash, marker, _SIZE_PT)
     if name in KNOWN:
         return KNOWN[name]
+    of_surface = _SURFACE_METHOD.search(name)
+    if of_surface and of_surface[1] in _OF_SURFACE:
+        return _OF_SURFACE[of_surface[1]]
     colour, free_dash = _FREE[_place(name, len(_FREE))]
     markers = [marker for marker in SYMBOLS if (colour, marker) not in _MARKED]
     return Look(colour, 1.2, free_dash, markers[_place(name[::-1], len(markers))], _SIZE_PT)

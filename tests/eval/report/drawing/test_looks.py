@@ -7,7 +7,10 @@ import pytest
 
 from cdpipe.model.config import preset_files
 from eval.core.charts import DASHES, SYMBOLS
+from eval.plans.plan import load_plan
+from eval.plans.variants import name_variant
 from eval.report.drawing.looks import COLOURS, GREY, KNOWN, line_of, look_of
+from eval.tables.rows import is_told_the_truth
 
 # Machado, Oliveira and Fernandes (2009), severity 1: what linear red, green and blue become for the colour-blind
 SEEN = {
@@ -66,3 +69,15 @@ def test_a_name_has_one_look_whatever_stands_beside_it() -> None:
     assert KNOWN["tunnelcd"].colour not in {look.colour for look in looks}
     assert len({(look.colour, look.dash, look.marker) for look in looks}) > 25
     assert line_of("mine").marker == "" and line_of("mine").colour == look_of("mine").colour
+
+
+def test_what_measures_the_rock_looks_like_the_method_of_its_name_and_unlike_the_others() -> None:
+    named = [name_variant(each.preset, each.set, each.oracle_merge) for each in load_plan("surface").variants]
+    variants = [name for name in named if not is_told_the_truth(name)]
+    looks = [look_of(name) for name in variants]
+    assert len(variants) == 6
+    assert len({(look.colour, look.dash) for look in looks}) == len({(look.colour, look.marker) for look in looks}) == 6
+    assert look_of("tunnelcd[surface.method=m3c2-ep,m3c2.normal_m=0.5]") == KNOWN["m3c2-ep"]
+    assert look_of("tunnelcd[extract.method=surface,surface.method=planes]") == KNOWN["tunnelcd"]
+    new = {(look.colour, look.dash) for look in looks} - {(look.colour, look.dash) for look in KNOWN.values()}
+    assert len(new) == 2, "c2m and unrolled propose no regions elsewhere"

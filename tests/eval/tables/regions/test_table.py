@@ -23,6 +23,7 @@ TARGETS = Targets(
         Target(column="region_recall_at_k", name="recall", domain="out", at_least=0.5),
         Target(column="recall_at_0.1", name="less c2c", less="c2c", domain="in", at_least=0),
         Target(column="recall_at_0.1_proposed", name="proposals less c2c", less="c2c", domain="in", at_least=0),
+        Target(column="region_auroc", name="AUROC less c2c", less="c2c", domain="in", at_least=0),
         Target(column="silent_share", name="silent", at_least=0.95, least_km=5),
         Target(column="false_regions_per_100m_unchanged", name="false", at_most=0.1, least_km=5),
         Target(column="bytes_ratio", name="bytes", site="site1", at_least=10),
@@ -181,6 +182,16 @@ def test_a_rival_that_finds_more_makes_the_target_missed() -> None:
     ]
     target = the_target(tables(swapped, regions=regions)["regions_targets"], str(target["target"]), "in")
     assert (target["value"], target["is_met"]) == (-1.0, False)
+
+
+@pytest.mark.parametrize(("theirs", "is_met"), [(0.9, True), (1.0, False)])
+def test_a_mean_is_held_against_that_of_a_rival(theirs: float, is_met: bool) -> None:
+    rows = [changed("narrow", seed, region_auroc=auroc) for seed, auroc in enumerate((0.9, 1.0))]
+    rows += [{**row, "variant": "c2c", "region_auroc": theirs} for row in rows]
+    rows += [changed("cave", seed, name, region_auroc=0.5) for seed in range(2) for name in ("tunnelcd", "c2c")]
+    target = the_target(tables(rows)["regions_targets"], "AUROC less c2c", "in")
+    assert target["value"] == pytest.approx(0.95 - theirs)
+    assert target["is_met"] is is_met
 
 
 def test_proposals_are_held_against_a_rival_before_any_is_withdrawn() -> None:
