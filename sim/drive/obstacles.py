@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from itertools import product
+from operator import itemgetter
+
 import numpy as np
 from scipy import ndimage
 
@@ -22,6 +26,8 @@ _ACROSS_M = 0.1
 _BESIDE_WHEELS_M = 0.1
 # The body checked against the walls: the true gap may be this share of the clearance where the wall bulges.
 _TIGHTEST_SHARE = 0.5
+# So many obstacles beside one another get their sides together; no drift is wide enough for more.
+_MOST_ABREAST = 7
 
 Span = tuple[Float64Array, Float64Array]  # lowest and highest forbidden offset, (N,) each, NaN where all are free
 
@@ -69,8 +75,65 @@ def _keep_off(places: Float64Array, line: Float64Array, headings: Float64Array, 
     return low, high
 
 
+def pass_obstacles(
+    wanted: Float64Array, low: Float64Array, high: Float64Array, obstacles: Sequence[Span]
+) -> tuple[int, int] | None:
+    """Narrow the bounds of a line in place so that it passes all obstacles.
+
+    Each is passed on the side that is nearer to where the line wants to be. Where the sides so chosen leave no room for
+    one more, the sides of all obstacles abreast of it are chosen anew: of those that leave room the ones with the least
+    detour.
+
+    Args:
+        wanted: (N,) wanted offset to the left at each sample of the line, metres.
+        low: (N,) lower bound of the offset; changed in place.
+        high: (N,) upper bound; changed in place.
+        obstacles: What each forbids.
+
+    Returns:
+        Number of the obstacle that cannot be passed and the sample at which it bars the way, or None.
+    """
+    sides: dict[int, int] = {}
+    while True:
+        inner = low.copy(), high.copy()
+        barred = _pass_each(wanted, *inner, obstacles, sides)
+        if barred is None:
+            low[:], high[:] = inner
+            return None
+        number, sample = barred
+        free = np.flatnonzero(np.isnan(obstacles[number][0][sample:]))
+        abreast = slice(sample, sample + int(free[0]) if len(free) else len(wanted))
+        group = [each for each in range(number) if np.isfinite(obstacles[each][0][abreast]).any()][-_MOST_ABREAST:]
+        tries = []
+        for chosen in product((-1, 1), repeat=len(group) + 1):
+            tried = {**sides, **dict(zip((*group, number), chosen, strict=True))}
+            inner = low.copy(), high.copy()
+            if _pass_each(wanted, *inner, obstacles[: number + 1], tried) is None:
+                detour_m = np.maximum(inner[0] - wanted, 0.0) + np.maximum(wanted - inner[1], 0.0)
+                tries.append((float(detour_m.sum()), tried))
+        if not tries:
+            return barred
+        sides = min(tries, key=itemgetter(0))[1]
+
+
+def _pass_each(
+    wanted: Float64Array, low: Float64Array, high: Float64Array, obstacles: Sequence[Span], sides: Mapping[int, int]
+) -> tuple[int, int] | None:
+    """Narrow the bounds by one obstacle after another, those with a side on that side; else as `pass_obstacles`."""
+    for number, (near_low, near_high) in enumerate(obstacles):
+        sample = sidestep(wanted, low, high, near_low, near_high, sides.get(number, 0))
+        if sample is not None:
+            return number, sample
+    return None
+
+
 def sidestep(
-    wanted: Float64Array, low: Float64Array, high: Float64Array, near_low: Float64Array, near_high: Float64Array
+    wanted: Float64Array,
+    low: Float64Array,
+    high: Float64Array,
+    near_low: Float64Array,
+    near_high: Float64Array,
+    side: int = 0,
 ) -> int | None:
     """Narrow the bounds of a line in place so that it passes an obstacle on one side, each time it comes by.
 
@@ -80,9 +143,10 @@ def sidestep(
         high: (N,) upper bound; changed in place.
         near_low: (N,) lowest offset that the obstacle forbids, NaN where it is far.
         near_high: (N,) highest one.
+        side: 1 to pass it on the left, -1 on the right, 0 on the side that is nearer.
 
     Returns:
-        The first sample where neither side leaves room, or None.
+        The first sample where that side, or neither, leaves room, or None.
     """
     stations = np.flatnonzero(np.isfinite(near_low))
     for visit in np.split(stations, np.flatnonzero(np.diff(stations) > 1 / STEP_M) + 1):
@@ -90,8 +154,8 @@ def sidestep(
             continue
         shift_left = np.maximum(near_high[visit] - wanted[visit], 0.0).max()
         shift_right = np.maximum(wanted[visit] - near_low[visit], 0.0).max()
-        fits_left = (near_high[visit] <= high[visit]).all()
-        fits_right = (near_low[visit] >= low[visit]).all()
+        fits_left = side >= 0 and (near_high[visit] <= high[visit]).all()
+        fits_right = side <= 0 and (near_low[visit] >= low[visit]).all()
         if fits_left and (shift_left <= shift_right or not fits_right):
             low[visit] = np.maximum(low[visit], near_high[visit])
         elif fits_right:

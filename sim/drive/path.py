@@ -14,7 +14,7 @@ import numpy as np
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, stream
 from scenarios.schema import Scenario, SessionPlan
-from sim.drive.obstacles import Span, find_boulders, find_obstacles, sidestep
+from sim.drive.obstacles import Span, find_boulders, find_obstacles, pass_obstacles, sidestep
 from sim.geometry.line import STEP_M, smooth_between, smooth_line, tighten_bound
 from sim.geometry.noise import smooth_noise
 from sim.placement.lanes import body_heights_m, side_bounds
@@ -134,13 +134,14 @@ def _plan_offsets(
     key = int(stream(seed, session, "wander").integers(2**63))
     wanted = plan.lateral * room_m + scenario.platform.wander_m * smooth_noise((along_m,), _WANDER_LENGTH_M, key)
     _refuse_narrow(scenario, session, low, high)
-    for name, near_low, near_high in find_obstacles(world, scenario, session, line, headings, height_m):
-        barred = sidestep(wanted, low, high, near_low, near_high)
-        if barred is not None:
-            raise ScenarioError(
-                f"{session}: {name} bars the way {barred * STEP_M:.1f} m along the route: "
-                "move it to a side, make it smaller, or lower platform.clearance_m"
-            )
+    obstacles = find_obstacles(world, scenario, session, line, headings, height_m)
+    barred = pass_obstacles(wanted, low, high, [(near_low, near_high) for _, near_low, near_high in obstacles])
+    if barred is not None:
+        number, sample = barred
+        raise ScenarioError(
+            f"{session}: {obstacles[number][0]} bars the way {sample * STEP_M:.1f} m along the route: "
+            "move it to a side, make it smaller, or lower platform.clearance_m"
+        )
     stones = find_boulders(world, scenario, line, headings, float(width_m.max()))
     return _swerve_between(session, wanted, low, high, stones, _CHICANE_SHARE * clearance_m)
 

@@ -12,6 +12,7 @@ from cdpipe.core.geometry import Float64Array, invert, require_poses, travelled_
 from cdpipe.core.geometry.motion import Motion, make_motion
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios.schema import Floor, Odometry, Platform, Prop, Scenario, SessionPlan, Stones
+from sim.drive.obstacles import pass_obstacles, sidestep
 from sim.drive.path import plan_path
 from sim.drive.ride import follow_floor
 from sim.drive.trajectory import Trajectory, plan_trajectory, record
@@ -223,6 +224,33 @@ def test_a_line_winds_between_props_on_both_sides(
     closer = make_scenario(props=(left, right))
     with pytest.raises(ScenarioError, match="before: props "):
         plan_path(build_world(closer, 0), closer, 0, "before")
+
+
+def barring(first: int, end: int, low_m: float, high_m: float) -> tuple[Float64Array, Float64Array]:
+    """What an obstacle forbids, of a line of 200 samples."""
+    low, high = np.full(200, np.nan), np.full(200, np.nan)
+    low[first:end], high[first:end] = low_m, high_m
+    return low, high
+
+
+@pytest.mark.parametrize("more", [(), (barring(95, 140, 1.0, 3.5),)])
+def test_sides_are_chosen_together_where_the_nearest_ones_leave_no_room(
+    more: tuple[tuple[Float64Array, Float64Array], ...],
+) -> None:
+    wanted, low, high = (np.full(200, each) for each in (-2.0, -3.0, 3.0))
+    # alone, the first one is passed between it and the wall, half a metre away; the second leaves no room there
+    obstacles = (barring(50, 90, -2.5, -1.0), barring(70, 110, -3.5, -2.2), *more)
+    assert sidestep(wanted, low.copy(), high.copy(), *obstacles[0]) is None
+    assert pass_obstacles(wanted, low, high, obstacles) is None
+    assert (low[50:90] == -1.0).all() and (low[90:110] == -2.2).all() and (low[110:] == -3.0).all()
+    assert (high[:95] == 3.0).all() and high[100] == (1.0 if more else 3.0)
+
+
+def test_what_bars_the_way_on_every_side_is_named_with_its_place() -> None:
+    wanted, low, high = (np.full(200, each) for each in (-2.0, -3.0, 3.0))
+    obstacles = (barring(50, 90, -2.5, -1.0), barring(60, 80, -1.5, 3.5), barring(70, 110, -3.5, -2.2))
+    assert pass_obstacles(wanted, low, high, obstacles) == (2, 70)
+    assert (low == -3.0).all() and (high == 3.0).all()
 
 
 _CHICANE = (("left", 0.4, 1.0), ("right", 0.5, -1.0))
