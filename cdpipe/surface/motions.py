@@ -26,14 +26,15 @@ _L1_SHARE = 0.1
 _TUKEY = 4.685
 _TO_SIGMA = 1.4826
 _LEAST_SIGMA_M = 3e-4
-# Rotation and translation that nothing constrains stay zero.
-_DAMPING = 1e-3
+# Rotation and translation that nothing constrains stay zero, also where no offset has a lever for any rotation.
+_DAMPING, _LEAST_DIAGONAL = 1e-3, 1e-9
 # A residual that many times the noise says that much of a window moved. The fit is then begun on each half of the
 # round alone, too. It is taken where that share of the window is within twice the noise, more of it than by the first
 # fit, and most of what is within six times: what moved lies apart. No motion leaves such a part of a convergence all
 # round.
 _MUCH, _WITHIN, _NEAR = 3.0, 2.0, 6.0
 _LEAST_SHARE, _MORE, _APART = 0.3, 0.1, 0.7
+_EMPTY_SHARE = 1e-6  # a half with less of the weights holds no rock, as that below a floor without walls
 _NOISE_SAMPLE = 20_000  # about so many offsets tell the noise
 # Neighbouring places err together: a block of this edge counts as one observation in the covariance.
 _BLOCK_M = 1.0
@@ -155,7 +156,10 @@ def _fit_best(
     best, normals = max(count(motion, _WITHIN) + _MORE, _LEAST_SHARE), jacobian[:, 3:]
     across = np.linalg.eigh((normals * share[:, None]).T @ normals)[1][:, 1:].T
     for half in (*across, *-across):
-        found = _fit(jacobian, along_m, share, points, share * (normals @ half > 0), noise_m)
+        start = share * (normals @ half > 0)
+        if start.sum() <= _EMPTY_SHARE * share.sum():
+            continue
+        found = _fit(jacobian, along_m, share, points, start, noise_m)
         held = count(found[0], _WITHIN)
         if held > best and held > _APART * count(found[0], _NEAR):
             best, (motion, covariance) = held, found
@@ -177,14 +181,18 @@ def _fit(
     weights, motion = (share if start is None else start).copy(), np.zeros(6)
     for number in range(_ROUNDS):
         hessian = (jacobian * weights[:, None]).T @ jacobian
-        hessian += _DAMPING * np.diag(np.diag(hessian).reshape(2, 3).max(axis=1).repeat(3))
+        of_block = np.maximum(np.diag(hessian).reshape(2, 3).max(axis=1), _LEAST_DIAGONAL)
+        hessian += _DAMPING * np.diag(of_block.repeat(3))
         motion[:] = np.linalg.solve(hessian, (jacobian * weights[:, None]).T @ along_m)
         residual_m = np.abs(along_m - jacobian @ motion)
         sigma_m = noise_m or max(_TO_SIGMA * float(np.median(residual_m)), _LEAST_SIGMA_M)
         if number < _L1_ROUNDS:
             weights = share / np.maximum(residual_m, max(_L1_SHARE * sigma_m, _LEAST_SIGMA_M))
-        else:
-            weights = share * np.maximum(1 - (residual_m / (_TUKEY * sigma_m)) ** 2, 0.0) ** 2
+            continue
+        near = share * np.maximum(1 - (residual_m / (_TUKEY * sigma_m)) ** 2, 0.0) ** 2
+        if not near.any():  # all that weighs moved otherwise: the motion stands
+            break
+        weights = near
     _, block = np.unique(cell_keys(points, _BLOCK_M), return_inverse=True)
     counts = np.bincount(block)
     signed_m = np.clip(along_m - jacobian @ motion, -3 * sigma_m, 3 * sigma_m)

@@ -353,6 +353,38 @@ def test_motions_are_found_again_with_a_third_of_outliers() -> None:
     np.testing.assert_allclose(found.along(points, normals, points[:, 0])[0], clean_m, atol=5e-4)
 
 
+@pytest.mark.parametrize("tilt", [0.0, 0.01])
+def test_motions_of_a_floor_of_which_a_strip_heaved(tilt: float) -> None:
+    """No normal points down: a fit that begins on that half has nothing to begin with."""
+    rng = stream(7, "floor")
+    points = np.column_stack([rng.uniform(0, 12, 3000), rng.uniform(-2.5, 2.5, 3000), np.zeros(3000)])
+    normals = np.array([0.0, 0, 1]) + rng.normal(0, tilt, (3000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    is_still = points[:, 1] < 1.2
+    along_m = rng.normal(0, 5e-4, 3000) + np.where(is_still, 0.0, 0.05)
+    moved_m, variance_m2 = fit_motions(points, normals, along_m, points[:, 0], 8.0).along(points, normals, points[:, 0])
+    np.testing.assert_allclose(moved_m[is_still], 0.0, atol=5e-4)
+    assert np.isfinite(variance_m2).all()
+
+
+def test_offsets_at_one_point_tell_no_rotation() -> None:
+    along_m = stream(8, "lever").normal(0, 5e-4, 600) + np.repeat([0.0, 0.05], 300)
+    found = fit_motions(np.tile([1.0, 2, 3], (600, 1)), np.tile([0.0, 0, 1], (600, 1)), along_m, np.zeros(600), 8.0)
+    assert (found.motions[:, :3] == 0).all()
+    assert np.isfinite(found.covariances).all()
+
+
+def test_offsets_of_which_none_is_near_the_motion_of_all() -> None:
+    """Those that agree lie at the end of the window of the station at 8 m, and weigh nothing there."""
+    points = np.column_stack([stream(9, "near").uniform(-2, 2, (600, 2)), np.zeros(600)])
+    points = np.concatenate([points, points[:200], points[:200]])
+    along_m = np.repeat([0.0, -0.09, 0.09], [600, 200, 200])
+    path_m = np.repeat([0.0, 8.0], [600, 400])
+    found = fit_motions(points, np.tile([0.0, 0, 1], (1000, 1)), along_m, path_m, 8.0)
+    np.testing.assert_allclose(found.motions, 0.0, atol=1e-9)
+    assert np.isfinite(found.covariances[[0, -1]]).all()
+
+
 @pytest.mark.parametrize("apart_m", [5.0, 8.0, 15.0])
 def test_stations_far_from_one_another_tell_motions_where_they_stand(apart_m: float) -> None:
     rng = stream(6, "stations")
