@@ -147,7 +147,7 @@ def _claim(out: Path, story: Path, sessions: dict[int, Path], method: Method) ->
     """
     wanted = {
         "tool": "tunnelcd story",
-        "story": {f"{number:02d}": _digest_session(path) for number, path in sessions.items()},
+        "story": _digest_story(story, sessions),
         "preset": method.preset,
         "config": digest(method.config.model_dump(mode="json", exclude=WEIGHTS_FILES)),
         # the digests name the weights, wherever their files lie
@@ -167,11 +167,28 @@ def _claim(out: Path, story: Path, sessions: dict[int, Path], method: Method) ->
     write_json(mark, wanted | {"settings": list(method.settings), "site": method.site, "versions": versions()})
 
 
+def _digest_story(story: Path, sessions: dict[int, Path]) -> dict[str, str]:
+    """Return a digest of each session by its number, and of what the truth of a simulated story follows from.
+
+    story.json holds digests of all files of its sessions, so that these are not read. Poses and description alone can
+    be equal in two stories, as where one has a sensor without dropouts.
+    """
+    told = read_story(story) if is_story(story) else None
+    known = {} if told is None else told.digests
+    found = {
+        f"{number:02d}": digest(known[path.name]) if path.name in known else _digest_session(path)
+        for number, path in sessions.items()
+    }
+    if told is not None:
+        found["truth"] = digest(told.model_dump(mode="json", exclude={"digests", "versions"}))
+    return found
+
+
 def _digest_session(session: Path) -> str:
-    """Return a digest of a session's poses and description, which differ between any two sessions."""
+    """Return a digest of a session's description, poses and scans."""
     found = hashlib.sha256()
-    for name in ("session.json", "odometry.npz"):
-        found.update(read_bytes(session / name))
+    for path in (session / "session.json", session / "odometry.npz", *sorted((session / "chunks").glob("*.npz"))):
+        found.update(hashlib.sha256(read_bytes(path)).digest())
     return found.hexdigest()[:16]
 
 

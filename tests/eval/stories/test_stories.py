@@ -271,6 +271,40 @@ def test_answers_of_other_weights_are_never_mixed(
     assert code == 2 and "is the report of another method, settings or weights" in err
 
 
+def test_a_story_with_equal_poses_and_other_scans_or_truth_is_another_one(
+    told: tuple[Path, Story], oracle: Oracle, command: Command, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(told[0], other)
+    argv = ("story", other, "--out", oracle.out, "-q")
+    oracle.stop = {"session-02": KeyboardInterrupt()}
+    assert command(*argv)[0] == 130
+    text = (other / "story.json").read_text()
+    scans = told[1].digests["session-02"]["chunks/00000.npz"]
+    assert scans in text and '"seed": 1' in text
+    for changed in (text.replace(scans, "0" * 64), text.replace('"seed": 1', '"seed": 2')):
+        (other / "story.json").write_text(changed)
+        code, _, err = command(*argv)
+        assert code == 2 and "is the report of another story" in err
+    (other / "story.json").write_text(text)
+    assert command(*argv)[0] == 130
+
+
+def test_recorded_sessions_with_other_scans_are_another_story(
+    told: tuple[Path, Story], oracle: Oracle, command: Command, tmp_path: Path
+) -> None:
+    recorded = tmp_path / "recorded"
+    shutil.copytree(told[0], recorded)
+    (recorded / "story.json").unlink()
+    argv = ("story", recorded, "--out", oracle.out, "-q")
+    oracle.stop = {"session-02": KeyboardInterrupt()}
+    assert command(*argv)[0] == 130
+    scans = recorded / "session-03" / "chunks" / "00000.npz"
+    scans.write_bytes(scans.read_bytes() + b"changed")
+    code, _, err = command(*argv)
+    assert code == 2 and "is the report of another story" in err
+
+
 def test_a_story_that_lost_a_session_is_refused(told: tuple[Path, Story], tmp_path: Path) -> None:
     lost = tmp_path / "lost"
     shutil.copytree(told[0], lost)
