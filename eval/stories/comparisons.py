@@ -13,6 +13,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cdpipe
 from cdpipe.core.errors import InputError, MergeFailedError
@@ -21,7 +22,7 @@ from cdpipe.descriptors import list_checkpoints
 from cdpipe.io.answer import Answer, read_answer, write_failure
 from cdpipe.io.session import is_session
 from cdpipe.model.config import WEIGHTS_FILES, PipelineConfig, Site
-from eval.core.output import make_writable, new_folder, require_no_links
+from eval.core.output import make_writable, new_folder, only_writer, require_no_links
 from eval.core.provenance import digest, versions
 from eval.core.terminal.progress import RunProgress
 from eval.running.runfolder import write_json
@@ -104,12 +105,23 @@ def run_comparisons(
         with_truth: Whether pairs with truth are made, where the folder is that of a simulated story.
 
     Raises:
-        InputError: The folder is no story, `out` is of another story or other settings, or cannot be written.
+        InputError: The folder is no story; `out` is of another story or other settings, cannot be written, or another
+            process writes there.
     """
     sessions = list_sessions(story)
     has_truth = with_truth and is_story(story)
     maker = PairMaker(story) if has_truth else None
-    _claim(out, story, sessions, method)
+    mark = _describe(story, sessions, method)
+    make_writable(out)
+    with only_writer(out, "tunnelcd story"):
+        _claim(out, story, mark, method)
+        return _compare(sessions, out, method, progress, maker)
+
+
+def _compare(
+    sessions: dict[int, Path], out: Path, method: Method, progress: RunProgress, maker: PairMaker | None
+) -> list[Comparison]:
+    """Compare session 1 with every later one, as `run_comparisons` does, with truth where there is who makes it."""
     done = []
     later = [number for number in sessions if number > 1]
     for count, number in enumerate(later):
@@ -139,13 +151,9 @@ def _answer(before: Path, after: Path, folder: Path, method: Method, progress: R
     cdpipe.save_report(report, folder, method.preset)
 
 
-def _claim(out: Path, story: Path, sessions: dict[int, Path], method: Method) -> None:
-    """Mark a folder as that of this story and method, or check that it is.
-
-    Raises:
-        InputError: It is of another one, holds something else, or cannot be written.
-    """
-    wanted = {
+def _describe(story: Path, sessions: dict[int, Path], method: Method) -> dict[str, Any]:
+    """Return what must be the same for a finished comparison to be kept."""
+    return {
         "tool": "tunnelcd story",
         "story": _digest_story(story, sessions),
         "preset": method.preset,
@@ -153,6 +161,14 @@ def _claim(out: Path, story: Path, sessions: dict[int, Path], method: Method) ->
         # the digests name the weights, wherever their files lie
         "checkpoints": list_checkpoints(method.config),
     }
+
+
+def _claim(out: Path, story: Path, wanted: dict[str, Any], method: Method) -> None:
+    """Mark an empty folder as that of this story and method, or check that it is.
+
+    Raises:
+        InputError: It is of another one, holds something else, or cannot be written.
+    """
     mark = out / _MARK
     if mark.is_file():
         require_no_links(out)
@@ -161,9 +177,8 @@ def _claim(out: Path, story: Path, sessions: dict[int, Path], method: Method) ->
             differing = "story" if found.get("story") != wanted["story"] else "method, settings or weights"
             raise InputError(f"{out}: is the report of another {differing} than {story}: name a new folder")
         return
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if any(out.iterdir()):
         raise InputError(f"{out}: is not empty, and no report of a story: name a new or empty folder")
-    make_writable(out)
     write_json(mark, wanted | {"settings": list(method.settings), "site": method.site, "versions": versions()})
 
 

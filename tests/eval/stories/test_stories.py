@@ -16,6 +16,7 @@ from cdpipe.descriptors.sphere_network import make_untrained_sphere_network
 from cdpipe.descriptors.weights_file import checkpoint_bytes
 from cdpipe.io.session import read_session
 from cdpipe.model.report import ChangedObject, ChangeReport, SurfaceField
+from eval.core.output import only_writer
 from eval.stories.comparisons import Method, list_sessions
 from eval.stories.page import displacement_table
 from eval.stories.places import _measure, choose_places, follow_places
@@ -153,6 +154,14 @@ def test_an_interrupted_report_goes_on_where_it_stopped(
     oracle.stop = {}
     assert command("story", told[0], "--out", oracle.out, "-q")[0] == 0
     assert oracle.asked == ["session-02", "session-03", "session-03"]
+
+
+def test_a_second_report_in_the_folder_is_refused(told: tuple[Path, Story], oracle: Oracle, command: Command) -> None:
+    oracle.out.mkdir()
+    with only_writer(oracle.out, "tunnelcd story"):
+        code, _, err = command("story", told[0], "--out", oracle.out, "-q")
+    assert code == 2 and "another `tunnelcd story` writes there" in err
+    assert list(oracle.out.iterdir()) == []
 
 
 def test_a_refused_merge_is_a_gap_that_the_page_names(
