@@ -71,26 +71,33 @@ def _find_passes(odom_T_sensor: Float64Array) -> int | None:
     cuts = np.unique(np.searchsorted(way_m, np.linspace(_PASS_M, way_m[-1] - _PASS_M, _CUTS)))
     if way_m[-1] < 2 * _PASS_M:
         return None
-    shares = np.array([_covered_share(places[:cut], places[cut:]) for cut in cuts])
+    # a scan counts half of the ways from the one before and to the next: where the sensor stood, there are many scans
+    own_m = np.diff(way_m, prepend=way_m[0]) / 2 + np.diff(way_m, append=way_m[-1]) / 2
+    shares = np.array([_covered_share(places, own_m, cut) for cut in cuts])
     good = cuts[(shares >= _COVERED) & (shares >= shares.max() - _AS_GOOD)]
     if not len(good):
         return None
     return int(good[np.abs(way_m[good] - way_m[-1] / 2).argmin()])
 
 
-def _covered_share(one: Float64Array, other: Float64Array) -> float:
-    """Return the share of either path (N, 3), (M, 3) within `NEAR_M` of the other, the smaller of both.
+def _covered_share(places: Float64Array, own_m: Float64Array, cut: int) -> float:
+    """Return the share of the way of either part of a path within `NEAR_M` of the other part, the smaller of both.
 
     The metres on either side of the cut are near each other on any path, and count for nothing.
+
+    Args:
+        places: (N, 3) of the scans.
+        own_m: (N,) length of the way that each stands for.
+        cut: The first scan of the second part.
     """
-    if not len(one) or not len(other):
+    if not 0 < cut < len(places):
         return 0.0
-    joint = one[-1]
+    is_asked = np.linalg.norm(places - places[cut - 1], axis=1) > NEAR_M
+    one, other = np.flatnonzero(is_asked[:cut]), cut + np.flatnonzero(is_asked[cut:])
+    if not own_m[one].any() or not own_m[other].any():
+        return 0.0
     shares = []
-    for path, towards in ((one, other), (other, one)):
-        far = towards[np.linalg.norm(towards - joint, axis=1) > NEAR_M]
-        asked = path[np.linalg.norm(path - joint, axis=1) > NEAR_M]
-        if not len(far) or not len(asked):
-            return 0.0
-        shares.append(float(np.mean(cKDTree(far).query(asked)[0] <= NEAR_M)))
+    for part, towards in ((one, other), (other, one)):
+        is_near = np.asarray(cKDTree(places[towards]).query(places[part])[0]) <= NEAR_M
+        shares.append(float(np.average(is_near, weights=own_m[part])))
     return min(shares)

@@ -34,6 +34,18 @@ def test_two_laps_are_two_passes() -> None:
     assert abs(len(split.before) - len(split.after)) <= 8
 
 
+@pytest.mark.parametrize("stands_m", [3.0, 28.0])
+def test_the_scans_of_a_sensor_that_stood_are_no_way(stands_m: float) -> None:
+    """Of 40 m and 12 m back 28 m are driven once, however long the sensor stood where it passed twice, or once."""
+    drive = path((0, 0), (40, 0), (28, 0.4))
+    stop = int(np.argmin(np.abs(drive[:, 0, 3] - (40.0 - stands_m))))
+    stood = np.concatenate([drive[:stop], np.repeat(drive[stop : stop + 1], 600, axis=0), drive[stop:]])
+    assert split_scans(stood, "auto", "drive").name == split_scans(drive, "auto", "drive").name == "alternate"
+    there_and_back = path((0, 0), (30, 0), (4, 0.4))
+    stood = np.concatenate([np.repeat(there_and_back[:1], 600, axis=0), there_and_back])
+    assert abs(split_scans(stood, "auto", "drive").after[0] - 660) <= 4
+
+
 def test_a_way_driven_once_gives_every_other_revolution() -> None:
     poses = path((0, 0), (30, 0))
     split = split_scans(poses, "auto", "drive")
