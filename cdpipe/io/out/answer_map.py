@@ -14,7 +14,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array
 from cdpipe.core.progress import Progress
 from cdpipe.io.answer import Answer, read_answer
-from cdpipe.io.out.maps import PointMap, gather_map
+from cdpipe.io.out.maps import PointMap, gather_map, join_scalars
 from cdpipe.io.out.scans import Fields, Outgoing
 from cdpipe.mapping.mapping import choose_keyframes
 from cdpipe.model.aligned import alignment_of
@@ -34,7 +34,7 @@ def gather_answer_map(
 ) -> PointMap:
     """Return the points of the before and the after session, one a cell, in the map frame of an answer.
 
-    The values are those of `gather_map`, and
+    The values are those of `gather_map`, NaN for the points of a session that lacks them, and
 
     - `session`: 0 before, 1 after;
     - `change`: place in `KINDS`; `instance`: 1 for the first object of the answer, 0 for none;
@@ -105,11 +105,8 @@ def _mark_points(cloud: PointMap, answer: Answer, name: SessionName) -> None:
 
 def _join(clouds: Sequence[PointMap], report: ChangeReport) -> PointMap:
     trees = [cKDTree(cloud.points) for cloud in clouds]
-    shared = set(clouds[0].scalars) & set(clouds[1].scalars)
-    scalars = {
-        name: np.concatenate([cloud.scalars[name] for cloud in clouds]) for name in clouds[0].scalars if name in shared
-    }
     lengths = [len(cloud.points) for cloud in clouds]
+    scalars = join_scalars([cloud.scalars for cloud in clouds], lengths)
     scalars["session"] = np.repeat(np.arange(2, dtype=np.int32), lengths)
     away_m = [_distance(cloud.points, tree) for cloud, tree in zip(clouds, trees[::-1], strict=True)]
     scalars["distance"] = np.concatenate(away_m)
@@ -125,10 +122,12 @@ def _distance(points: Float64Array, tree: cKDTree) -> npt.NDArray[np.float32]:
 
 def _displacement(points: Float64Array, instance: Int32Array, report: ChangeReport) -> npt.NDArray[np.float32]:
     found = np.full(len(points), np.nan, np.float32)
-    if report.surface is not None and len(report.surface.points_map):
-        away_m, nearest = cKDTree(report.surface.points_map).query(points, distance_upper_bound=_NEAR_M)
+    measured = [] if report.surface is None else np.flatnonzero(np.isfinite(report.surface.displacement_m))
+    if report.surface is not None and len(measured):
+        tree = cKDTree(report.surface.points_map[measured])
+        away_m, nearest = tree.query(points, distance_upper_bound=_NEAR_M)
         is_near = np.isfinite(away_m) & (instance == 0)
-        found[is_near] = report.surface.displacement_m[np.asarray(nearest)[is_near]]
+        found[is_near] = report.surface.displacement_m[measured][np.asarray(nearest)[is_near]]
     for index, item in enumerate(report.objects):
         moved_m = np.nan if item.displacement_map is None else float(np.linalg.norm(item.displacement_map))
         found[instance == index + 1] = moved_m

@@ -25,7 +25,7 @@ def write_laz(path: Path, cloud: PointMap) -> None:
     """Write a map as LAS 1.4, compressed where the name ends in .laz, coordinates rounded to 0.1 mm.
 
     `intensity` and `time` become fields of the format (uint16 and `gps_time`), all others extra dimensions. Intensities
-    of 0 to 1 are scaled to the 16 bits, others rounded, each `session` by itself; NaN becomes 0.
+    of 0 to 1 are scaled to the 16 bits, others rounded, each `session` by itself; NaN becomes 0 in either.
 
     Raises:
         InputError: The extra `formats` is not installed.
@@ -43,7 +43,8 @@ def write_laz(path: Path, cloud: PointMap) -> None:
     data = laspy.LasData(header)
     data.x, data.y, data.z = cloud.points.T
     for name, values in cloud.scalars.items():
-        data[_STANDARD.get(name, name[:_MOST_NAME])] = _as_16_bits(cloud) if name == "intensity" else values
+        told = _as_16_bits(cloud) if name == "intensity" else np.nan_to_num(values) if name == "time" else values
+        data[_STANDARD.get(name, name[:_MOST_NAME])] = told
     with path.open("wb") as file:
         data.write(file, do_compress=path.suffix.lower() == ".laz")
 

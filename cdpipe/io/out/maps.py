@@ -44,11 +44,18 @@ def gather_map(outgoing: Outgoing, cell_m: float, report: Progress) -> PointMap:
         points.append(points_odom[is_first])
         found = scan.scalars | (_recorded(scan) if outgoing.has_scans else {})
         scalars.append({name: values[is_first] for name, values in found.items()})
-    return PointMap(np.concatenate(points), _join(scalars, [len(part) for part in points]))
+    return PointMap(np.concatenate(points), join_scalars(scalars, [len(part) for part in points]))
 
 
-def _join(scalars: Sequence[Mapping[str, npt.NDArray[Any]]], lengths: Sequence[int]) -> dict[str, npt.NDArray[Any]]:
-    """Return the values of all scans by name, NaN for the points of scans without."""
+def join_scalars(
+    scalars: Sequence[Mapping[str, npt.NDArray[Any]]], lengths: Sequence[int]
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the values of all parts by name, NaN for the points of parts without: whole numbers become floats there.
+
+    Args:
+        scalars: Values (N,) by name, of each part.
+        lengths: Points N of each part.
+    """
     parts = list(zip(scalars, lengths, strict=True))
     names = dict.fromkeys(name for found in scalars for name in found)
     return {
