@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import Float64Array
+from cdpipe.model.report import SurfaceField
 from eval.core.charts import BLUE, CONTEXT, ORANGE, Axis, Drawing, Look, Panel, Series
 from eval.core.figures import data_address
 from eval.report.drawing.charts import Chart
 from eval.report.render import render_page, write_file
 from eval.report.surface.unrolled import draw_panels
 from eval.report.tables import Cell, Picture, Table
-from eval.scoring.surface.places import SurfacePlaces, carry_surface
 from eval.stories.comparisons import Comparison, Method, refused_sessions
 from eval.stories.places import RADIUS_M, ChosenPlace, choose_places, follow_places, is_measured
 from eval.stories.props import HIDDEN, MISSED, NO_ANSWER, OTHER_KIND, RIGHT, count_objects, follow_props
@@ -204,13 +205,16 @@ def draw_unrolled_story(comparisons: Sequence[Comparison]) -> Picture | None:
         return None
     last = known[-1][1]
     assert last is not None and last.chainage_m is not None and last.angle_deg is not None
-    n = len(last.displacement_m)
-    points = SurfacePlaces(last.points_map, np.zeros(n), np.zeros(n, np.int64), np.ones(n, dtype=np.bool_))
-    panels = []
-    for number, field in known:
-        said = carry_surface(field, points)
-        panels.append((f"session {number}", np.where(said.is_covered, said.answered_m, np.nan)))
+    panels = [(f"session {number}", _displacement_at(last.points_map, field)) for number, field in known]
     moved_m = np.abs(last.displacement_m[last.region >= 0])
     figure, bound_mm = draw_panels(panels, last.chainage_m, last.angle_deg, moved_m[np.isfinite(moved_m)])
     caption = f"Along the drift and about its axis. Grey: not measured. Colours end at {bound_mm:.0f} mm."
     return Picture("Displacement since session 1, unrolled", data_address(figure), caption)
+
+
+def _displacement_at(points: Float64Array, field: SurfaceField) -> Float64Array:
+    """Return the displacement (P,) of the place nearest to each of (P, 3) points, within 0.3 m; NaN where none is."""
+    if not len(field.points_map):
+        return np.full(len(points), np.nan)
+    apart_m, nearest = cKDTree(field.points_map).query(points)
+    return np.where(np.asarray(apart_m) <= RADIUS_M, field.displacement_m[np.asarray(nearest)], np.nan)

@@ -118,7 +118,7 @@ def is_measured(comparisons: Sequence[Comparison]) -> bool:
 
 
 def _measure(surface: SurfaceField | None, point: Float64Array) -> dict[str, float | None]:
-    found: dict[str, float | None] = {**dict.fromkeys(_MEASURED, _NAN), "n_points": 0, "is_beyond_level": False}
+    found: dict[str, float | None] = {**dict.fromkeys(_MEASURED, _NAN), "n_points": 0, "is_beyond_level": None}
     rows = _rows_near(surface, point)
     if surface is None or not len(rows):
         return found

@@ -18,7 +18,7 @@ from cdpipe.io.session import read_session
 from cdpipe.model.report import ChangedObject, ChangeReport, SurfaceField
 from eval.core.output import only_writer
 from eval.stories.comparisons import Method, list_sessions
-from eval.stories.page import displacement_table
+from eval.stories.page import _displacement_at, displacement_table
 from eval.stories.places import _measure, choose_places, follow_places
 from eval.truth.ground_truth import load_ground_truth
 from scenarios.schema import (
@@ -200,6 +200,23 @@ def test_a_level_that_a_point_lacks_is_that_of_the_others() -> None:
         found = _measure(field, np.zeros(3))
         np.testing.assert_allclose([found["displacement_m"], found["level_m"]], [0.01, level_m])
         assert found["is_beyond_level"] is is_beyond
+
+
+def test_where_nothing_was_measured_nothing_is_beyond_a_level() -> None:
+    nan = np.full(1, np.nan)
+    field = SurfaceField(np.zeros((1, 3)), np.eye(3)[:1], nan, nan, np.full(1, -1, np.int32))
+    for surface in (None, field):
+        found = _measure(surface, np.zeros(3))
+        assert found["n_points"] == 0 and found["is_beyond_level"] is None
+
+
+def test_an_unmeasured_place_is_grey_beside_measured_ones() -> None:
+    points, nan = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.4, 0.0, 0.0]]), np.full(3, np.nan)
+    field = SurfaceField(points, np.eye(3), np.array([0.01, np.nan, 0.03]), nan, np.full(3, -1, np.int32))
+    asked = np.array([[0.0, 0, 0], [0.2, 0, 0], [0.4, 0, 0], [0.69, 0, 0], [0.71, 0, 0]])
+    np.testing.assert_array_equal(_displacement_at(asked, field), [0.01, np.nan, 0.03, 0.03, np.nan])
+    none = SurfaceField(np.zeros((0, 3)), np.zeros((0, 3)), nan[:0], nan[:0], np.zeros(0, np.int32))
+    assert np.isnan(_displacement_at(asked, none)).all()
 
 
 def test_without_truth_the_sessions_alone_are_compared(
