@@ -58,8 +58,13 @@ _TILT_RAD, _CLOSE_M = 2e-3, 4.0
 # The variance of a mean from four folds is noisy: that of a place is the mean over its neighbours.
 _NEIGHBOURS = 8
 # Where less than that share of the occupied voxels has a displacement, and cells lie farther apart than that share of
-# the radius, the map is too thin: it needs a radius of that many times the distance. So many cells tell it.
+# a radius, the map is too thin: it needs a radius of that many times the distance. So many cells tell it.
 _MOST, _THIN, _WIDE, _SPACING_SAMPLE = 0.5, 0.6, 2.0, 20_000
+# What each method averages or joins cells over, beside the radius of the normals of the places, which is of all.
+_WIDTHS = MappingProxyType({
+    "planes": ("surface.radius_m",), "m3c2": ("m3c2.cylinder_m",), "m3c2-ep": ("m3c2.cylinder_m",), "c2c": (),
+    "c2m": ("surface.mesh_m",), "unrolled": ("surface.raster_m",),
+})  # fmt: skip
 # Least share of the roughness that both spheres do not share, as standard deviation, and the least error of a mean.
 _ROUGHNESS, _LEAST_M = 0.18, 0.0004
 # Two means over few cells of one rough surface differ by that share of what they would if each session drew its cells
@@ -88,7 +93,7 @@ def measure_surface(
     after = near_returns(merged, "after")
     measured = load_method(settings.method)(cells, after, places, chainage_m, config)
     measured = _within_search(measured)
-    _warn_of_thin_maps((cells, measured.after), measured.displacement_m, settings)
+    _warn_of_thin_maps((cells, measured.after), measured.displacement_m, config)
     is_rock, is_of_object = split_rock(objects, places, measured.along_m, measured.level_m)
     along_m, displacement_m = (
         np.where(is_of_object, np.nan, values) for values in (measured.along_m, measured.displacement_m)
@@ -107,21 +112,29 @@ def measure_surface(
 
 
 def _warn_of_thin_maps(
-    sessions: tuple[SurfaceCells, SurfaceCells | None], displacement_m: Float64Array, settings: SurfaceConfig
+    sessions: tuple[SurfaceCells, SurfaceCells | None], displacement_m: Float64Array, config: PipelineConfig
 ) -> None:
-    """Warn where most of the before surface has no displacement, as the spheres hold too few cells of a thin map."""
-    n_occupied = len(np.unique(cell_keys(sessions[0].points, settings.spacing_m)))
+    """Warn where most of the before surface has no displacement, as the method finds too few cells of a thin map."""
+    n_occupied = len(np.unique(cell_keys(sessions[0].points, config.surface.spacing_m)))
     if np.count_nonzero(np.isfinite(displacement_m)) >= _MOST * n_occupied:
         return
     apart_m = max(_spacing_m(each) for each in sessions if each is not None)
-    if apart_m > _THIN * settings.radius_m:
+    widths_m = {name: _value(config, name) for name in (*_WIDTHS[config.surface.method], "surface.normal_m")}
+    if apart_m > _THIN * min(widths_m.values()):
         wide_m = np.ceil(20 * _WIDE * apart_m) / 20
+        narrow = {name: value for name, value in widths_m.items() if value < wide_m}
+        told = " and ".join(f"{name} = {value:g}" for name, value in narrow.items())
         text = (
-            f"most of the rock has no displacement: points are {apart_m:.2f} m apart, and surface.radius_m = "
-            f"{settings.radius_m:g} and surface.normal_m = {settings.normal_m:g} hold too few: "
-            f"--set surface.radius_m={wide_m:g} --set surface.normal_m={wide_m:g}"
+            f"most of the rock has no displacement: points are {apart_m:.2f} m apart, and {told} "
+            f"hold{'s' * (len(narrow) == 1)} too few: {' '.join(f'--set {name}={wide_m:g}' for name in narrow)}"
         )
         warnings.warn(text, InputWarning, stacklevel=2)
+
+
+def _value(config: PipelineConfig, name: str) -> float:
+    """Return the value of a setting that is named by its section and itself."""
+    section, _, own = name.partition(".")
+    return float(getattr(getattr(config, section), own))
 
 
 def _spacing_m(cells: SurfaceCells) -> float:

@@ -302,12 +302,13 @@ def test_thin_maps_are_warned_of_and_measured_with_larger_spheres() -> None:
     before, after = thinned(tunnel(1)), thinned(tunnel(2, lambda x_m, _: np.where(np.abs(x_m - 6.0) < 2.0, 0.03, 0.0)))
     cells = make_cells(before)
     for radius_m, is_thin in ((0.2, True), (0.5, False)):
-        config = load_config("tunnelcd", [f"surface.radius_m={radius_m}", f"surface.normal_m={max(radius_m, 0.3)}"])
+        radii = [f"surface.radius_m={radius_m}", f"surface.normal_m={max(radius_m, 0.3)}"]
+        config = load_config("tunnelcd", ["surface.method=planes", *radii])
         places = choose_places(cells, before, 0.25, config.surface.normal_m)
         found = measure_planes(cells, after, places, unroll(places.points, PATH)[0], config)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            _warn_of_thin_maps((cells, found.after), found.displacement_m, config.surface)
+            _warn_of_thin_maps((cells, found.after), found.displacement_m, config)
         told = [str(each.message) for each in caught if each.category is InputWarning]
         assert len(told) == is_thin
         assert all("0.2" in text and "surface.radius_m=0." in text for text in told)
@@ -317,6 +318,32 @@ def test_thin_maps_are_warned_of_and_measured_with_larger_spheres() -> None:
             assert known.mean() > 0.9
             middle = np.abs(places.points[:, 0] - 6.0) < 1.0
             assert np.nanmedian(found.displacement_m[middle]) == pytest.approx(0.03, abs=0.003)
+
+
+@pytest.mark.parametrize(
+    ("settings", "remedy"),
+    [
+        (["surface.method=planes"], "--set surface.radius_m=0.8 --set surface.normal_m=0.8"),
+        (["surface.method=planes", "surface.radius_m=0.9"], "--set surface.normal_m=0.8"),
+        (["surface.method=m3c2"], "--set m3c2.cylinder_m=0.8 --set surface.normal_m=0.8"),
+        (["surface.method=m3c2-ep"], "--set m3c2.cylinder_m=0.8 --set surface.normal_m=0.8"),
+        (["surface.method=c2c"], "--set surface.normal_m=0.8"),
+        (["surface.method=c2m"], "--set surface.mesh_m=0.8 --set surface.normal_m=0.8"),
+        (["surface.method=unrolled"], "--set surface.raster_m=0.8 --set surface.normal_m=0.8"),
+    ],
+)
+def test_the_warning_of_a_thin_map_names_settings_of_the_method(settings: list[str], remedy: str) -> None:
+    x, y = np.meshgrid(np.arange(20) * 0.39, np.arange(20) * 0.39)
+    points = np.column_stack([x.ravel(), y.ravel(), np.zeros(400)]) + 0.001
+    cells = make_cells(single_returns(points, points[:, 0], np.ones(400)), with_folds=False)
+    with pytest.warns(InputWarning) as caught:
+        _warn_of_thin_maps((cells, None), np.full(400, np.nan), load_config("tunnelcd", settings))
+    (text,) = (str(each.message) for each in caught)
+    assert text.endswith(f" too few: {remedy}")
+    given = load_config("tunnelcd", [*settings, *remedy.replace("--set ", "").split()])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _warn_of_thin_maps((cells, None), np.full(400, np.nan), given)
 
 
 def test_the_places_cover_the_area_of_the_tunnel(survey: Survey) -> None:
