@@ -31,8 +31,9 @@ def draw_states(scenario: Scenario, ground: Ground, seed: int, n_sessions: int) 
     and a prop ages, at one session. Convergence, heave and fill grow in every session; other rock changes at one.
 
     A session in which two props would stand in each other, or bar the way, is drawn again, up to 40 times. If none
-    fits, its props are those of the scenario's before session, and a warning tells it. The way is barred where the gap
-    is less than what the placing of props keeps free and less than what the first and the last session leave there.
+    fits, props that come, go or move are as in the scenario's before session, it takes that drive, and a warning tells
+    it. The way is barred where the gap is less than what the placing of props keeps free and less than what the first
+    and the last session leave there.
 
     Args:
         scenario: The scenario as drawn.
