@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from cdpipe.io.out.scans import START_NS, Outgoing
 from cdpipe.io.ply import write_ply_points
 from cdpipe.io.readers import RecordedScans, open_session
 from cdpipe.io.session import read_session
+from cdpipe.model.types import PosedScan
 from cdpipe.pipeline import detect
 from cdpipe.training.shard import read_shard
 from eval.graft import making
@@ -116,6 +117,49 @@ def test_bare_points_are_rays_to_the_millimetre(simulated: Path, tmp_path: Path,
         assert np.abs(points - made).max() < 6e-4
         off = np.cross(points, made) / np.linalg.norm(points, axis=1, keepdims=True)
         assert np.linalg.norm(off, axis=1).max() < 2e-5  # across the ray
+
+
+@pytest.mark.parametrize(
+    ("shone", "expected"),
+    [
+        ([[0.0, 0.25], [1.0, np.nan]], [[0, 64], [255, 0]]),  # shares of 1
+        ([[0.0, 1.0], [1.0, 0.0]], [[0, 1], [1, 0]]),
+        ([[-3.0, 17.4], [254.6, 100.0]], [[0, 17], [255, 100]]),
+        ([[0.0, 256.0], [400.0, 510.0]], [[0, 128], [200, 255]]),
+        ([[0.0, 65535.0], [512.0, np.inf]], [[0, 255], [2, 255]]),  # 16 bits
+        ([None, [3.0, 4.0]], [[0, 0], [3, 4]]),
+    ],
+)
+def test_intensities_of_bare_points_are_reflectivities(
+    shone: list[list[float] | None], expected: list[list[int]]
+) -> None:
+    source = Bare(shone)
+    session = as_session(source)
+    chunk = session.chunk(0)
+    assert chunk.reflectivity[:, 0].tolist() == expected
+    assert not chunk.signal.any()
+    for index, scan in enumerate(RecordedScans(session).scans()):
+        assert scan.intensity is not None
+        assert scan.intensity.tolist() == expected[index]
+
+
+class Bare:
+    """Scans of two bare points each, with intensities."""
+
+    name, descriptors_in, is_temporary = "bare", None, False
+
+    def __init__(self, shone: list[list[float] | None]) -> None:
+        self.shone, self.odom_T_sensor = shone, np.tile(np.eye(4), (len(shone), 1, 1))
+
+    def scan(self, index: int) -> PosedScan:
+        points = np.array([[1.0 + index, 0.0, 0.0], [0.0, 2.0 + index, 0.0]])
+        told = self.shone[index]
+        intensity = None if told is None else np.array(told, np.float32)
+        stamps_ns = np.full(2, index * 10**8)
+        return PosedScan(index, points, np.eye(4), stamps_ns, np.arange(2, dtype=np.int32), intensity=intensity)
+
+    def scans(self) -> Iterator[PosedScan]:
+        return (self.scan(index) for index in range(len(self.shone)))
 
 
 def test_a_map_without_its_scans_is_no_recording_to_graft_into(tmp_path: Path, command: Command) -> None:
