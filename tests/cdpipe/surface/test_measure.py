@@ -184,6 +184,21 @@ def test_angles_and_chainage_of_an_unrolled_tunnel() -> None:
     np.testing.assert_allclose(radius_m, RADIUS_M, atol=1e-9)
 
 
+@pytest.mark.parametrize("width_m", [3.0, 6.0])
+def test_a_crosscut_and_a_raise_do_not_move_the_axis(width_m: float) -> None:
+    """A drift of 4 by 4 m whose left wall opens for 12 m, and whose roof opens for 9 m, on a stretch of some metres."""
+    x_m, across_m = (each.ravel() for each in np.meshgrid(np.arange(0.1, 40, 0.2), np.arange(-1.9, 2, 0.2)))
+    open_from, flat = np.abs(x_m - 20.0) < width_m / 2, np.full(len(x_m), 2.0)
+    floor, right = np.column_stack([x_m, across_m, -flat]), np.column_stack([x_m, -flat, across_m])
+    roof = np.column_stack([x_m, across_m, np.where(np.abs(x_m - 31.0) < 1.5, 11.0, 2.0)])
+    left = np.column_stack([x_m, np.where(open_from, 14.0, 2.0), across_m])
+    path = make_pose(translation=np.column_stack([np.arange(0.0, 40.0, 0.25), np.full(160, 0.7), np.full(160, -0.5)]))
+    points = np.concatenate([floor, right, roof, left])
+    _, angle_deg, _ = unroll(points, path)
+    expected_deg = np.rad2deg(np.arctan2(points[:, 1], points[:, 2]))
+    np.testing.assert_allclose(angle_deg, expected_deg, atol=1e-6)
+
+
 def test_a_reversed_path_counts_from_the_other_end_and_swaps_the_walls() -> None:
     places = np.concatenate([wall_ring(x_m) for x_m in (2.3, 7.1)])
     forth, back = unroll(places, PATH), unroll(places, PATH[::-1])
