@@ -32,7 +32,7 @@ from eval.core.charts import (
 )
 
 DPI = 130
-_SLIM_SCALE, _WEBP_QUALITY = 0.75, 30
+_SLIM_SCALE, _WEBP_QUALITY = 0.75, 20
 _WIDTH_IN, _PX_PER_IN, _LEGEND_CHARACTERS, _LEGEND_LINE_IN = 9.0, 88.0, 145, 0.17
 _MARKERS = dict(zip(("", *SYMBOLS), ("", "o", "s", "D", "^", "v", "p", "*", "h", "X"), strict=True))
 
