@@ -16,8 +16,7 @@ from eval.core.output import make_writable
 from eval.core.statistics import interval_over_tunnels, mean, median, statistic_of
 from eval.core.terminal.printing import count_pairs
 from eval.leaderboard.calls import list_merges
-from eval.leaderboard.reference import take_other_methods
-from eval.plans.splits import version_name
+from eval.leaderboard.reference import take_other_methods, why_no_pair
 from eval.report.comparing.columns import COMPARED, figures_of, is_time
 from eval.report.comparing.differences import NOT_JUDGED, paired_differences, verdict
 from eval.report.render import write_file
@@ -228,7 +227,7 @@ def _notes(
 ) -> Iterator[str]:
     yield "means over pairs (time: median) with 95 % intervals; time is what an answer states, without merge"
     if not others:
-        yield from (_why_none(data, own) for data in references if data.results)
+        yield from (why_no_pair(data, len(own)) for data in references if data.results)
         if not any(data.results for data in references):
             yield "no reference results of these pairs: name a run or a report with --reference"
         return
@@ -260,18 +259,6 @@ def note_other_worlds(results: pd.DataFrame, references: Sequence[RunData]) -> I
         if rows and (worlds := find_other_worlds(results, pd.DataFrame(rows))):
             where = f"{count_pairs(len(worlds))} of {data.folder.path.name}"
             yield f"{where} hold other changes or another drive ({worlds[0]})"
-
-
-def _why_none(data: RunData, own: pd.DataFrame) -> str:
-    plan = data.provenance.get("plan")
-    split = str(plan.get("split", "")) if isinstance(plan, Mapping) else ""
-    version = split.removeprefix("sealed by ")
-    seeds = f"of split sealed of {version}" if version != split else "of other seeds"
-    if version == version_name():
-        seeds += ": evaluate with --split sealed"
-    elif version != split:
-        seeds += f": evaluate with --split sealed:{version.rpartition(' ')[2]}, of a later version by that one"
-    return f"{data.folder.path} holds none of these {len(own)} pairs; its pairs are {seeds}"
 
 
 def show_span(key: str, low: float, high: float) -> str:

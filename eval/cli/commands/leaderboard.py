@@ -80,7 +80,8 @@ def evaluate(
     from eval.leaderboard.calls import require_an_answer
     from eval.leaderboard.command import parse_command
     from eval.leaderboard.evaluation import Method, evaluate_command
-    from eval.leaderboard.reference import find_reference
+    from eval.leaderboard.reference import find_reference, why_nothing_compares
+    from eval.plans.cells import list_planned_cases
     from eval.plans.changes import change_plan
     from eval.plans.plan import load_plan
     from eval.running.runfolder import removed_if_empty, start_run_folder
@@ -88,6 +89,8 @@ def evaluate(
     method = Method(name, parse_command(command, gets_merge=merge != "own"), merge, time_limit)
     chosen = change_plan(load_plan(plan), seeds=seeds, split=split)
     committed = find_reference(chosen.name, reference)
+    pairs = sorted({(world, seed) for world, seed, _ in list_planned_cases(chosen)})
+    warn(why_nothing_compares(chosen.name, pairs, committed, out, name))
     with removed_if_empty(out), shown_progress(quiet, rate="pairs") as progress:
         run = start_run_folder(out)
         argv = ["tunnelcd", *sys.argv[1:]]

@@ -9,11 +9,15 @@ import pandas as pd
 import pytest
 
 from cdpipe.core.errors import InputError
+from eval.cli.main import main
 from eval.leaderboard.comparison import FIGURES, compare_with_reference, list_lines, write_tables_of
-from eval.leaderboard.reference import find_reference, take_other_methods
+from eval.leaderboard.reference import find_reference, take_other_methods, why_nothing_compares
+from eval.plans.cells import list_planned_cases
+from eval.plans.changes import change_plan
+from eval.plans.plan import load_plan
 from eval.plans.splits import version_name
 from eval.running.results.run_data import RunData, read_run
-from eval.running.runfolder import write_json
+from eval.running.runfolder import RunFolder, write_json
 from eval.scoring.scoring import METRICS_VERSION
 
 RECALLS = {"mine": (1.0, 0.5, 0.0), "tunnelcd": (1.0, 1.0, 0.5), "a": (0.0, 0.0, 0.0)}
@@ -92,11 +96,14 @@ def test_the_table_fits_80_columns(tmp_path: Path) -> None:
 
 def test_without_the_same_pairs_the_reason_is_told(tmp_path: Path) -> None:
     frame = table()
-    for version, advice in ((version_name(), "with --split sealed"), ("tunnelcd 0.0.1", "with --split sealed:0.0.1")):
+    for version, advice in (
+        (version_name(), "with --split sealed"), ("tunnelcd 0.0.1", "with --split sealed:0.0.1"),
+        ("tunnelcd 99.0.0", "evaluate with tunnelcd 99.0.0 and --split sealed"),
+    ):  # fmt: skip
         sealed = read(tmp_path / version, table((7, 8, 9)), f"sealed by {version}")
         found = compare_with_reference(own(frame), "mine", [sealed], {})
         assert found.table["method"].tolist() == ["mine"] and len(found.pairs) == 3
-        assert any(version in note and advice in note.replace(f" of {version}", "") for note in found.notes)
+        assert any(version in note and note.endswith(advice) for note in found.notes)
     partly = read(tmp_path / "partly", table((2, 3, 4)))
     found = compare_with_reference(own(frame), "mine", [take_other_methods(partly, "mine")], {})
     assert found.table["n_pairs"].tolist() == [2, 2, 2]
@@ -181,6 +188,56 @@ def test_references_are_found_by_folder_and_by_plan(tmp_path: Path) -> None:
     read(tmp_path / "old", table().assign(metrics_version=1))
     with pytest.raises(InputError, match="metrics version 1"):
         find_reference("x", tmp_path / "old")
+
+
+def pairs_of(plan: str, split: str) -> list[tuple[str, int]]:
+    return sorted({case[:2] for case in list_planned_cases(change_plan(load_plan(plan), split=split))})
+
+
+def test_an_evaluation_that_nothing_compares_with_says_so_before_it_runs(tmp_path: Path) -> None:
+    committed = find_reference("main", None)
+    assert committed is not None
+    split = f"sealed:{committed.provenance['plan']['split'].rpartition(' ')[2]}"
+    told = why_nothing_compares("main", pairs_of("main", "dev"), committed, tmp_path, "mine")
+    assert "reports/main holds none of these" in told and told.endswith(f"evaluate with --split {split}")
+    assert not why_nothing_compares("main", pairs_of("main", split), committed, tmp_path, "mine")
+    pair = ("narrow", 1)
+    other = read(tmp_path / "other", table((7, 8, 9)))
+    assert "seeds (7 to 9)" in why_nothing_compares("x", [pair], other, tmp_path, "mine")
+    # rows under its own name are no reference
+    alone = read(tmp_path / "alone", own(table()))
+    assert why_nothing_compares("x", [pair], alone, tmp_path, "mine")
+    assert not why_nothing_compares("x", [pair], alone, tmp_path, "b")
+
+
+def test_a_plan_without_reference_results_is_told_unless_the_run_holds_methods(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("eval.leaderboard.reference.REPORTS", tmp_path)
+    pairs = [("narrow", 1), ("narrow", 2)]
+    assert "plan x has no reference results" in why_nothing_compares("x", pairs, None, tmp_path / "run", "mine")
+    read(tmp_path / "x", table().assign(metrics_version=1))
+    assert find_reference("x", None) is None
+    assert "metrics version" in why_nothing_compares("x", pairs, None, tmp_path / "run", "mine")
+    for name, is_told in (("mine", True), ("tunnelcd", False)):
+        cell = RunFolder(tmp_path / "run").cell("narrow", 2, name)
+        cell.parent.mkdir(parents=True, exist_ok=True)
+        cell.write_text("{}")
+        assert bool(why_nothing_compares("x", pairs, None, tmp_path / "run", "mine")) == is_told
+
+
+def test_the_warning_comes_before_the_first_pair(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def evaluate(*_: object, **__: object) -> None:
+        assert capsys.readouterr().err.startswith("warning: nothing to compare with: plan smoke has no reference")
+        raise InputError("the first pair")
+
+    monkeypatch.setattr("eval.leaderboard.evaluation.evaluate_command", evaluate)
+    words = ["--command", "true {before} {after} {out}", "--as", "mine", "--out", str(tmp_path / "bench"), "--quiet"]
+    with pytest.raises(SystemExit):
+        main(["evaluate", "--plan", "smoke", *words])
+    assert capsys.readouterr().err == "error: the first pair\n"
 
 
 def test_domains_and_odometries_are_apart(tmp_path: Path) -> None:
