@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
-from cdpipe.core.errors import InputError
+from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.model.config import PipelineConfig
 from cdpipe.model.types import ScanSource
 
@@ -39,3 +40,13 @@ def adapt_to_whole_maps(
             "--before-T-after FILE"
         )
     return config.model_copy(update={"map": config.map.model_copy(update=_OFF)})
+
+
+def warn_of_whole_map(source: ScanSource) -> None:
+    """Warn that the descriptors of a map without scans recognise no place."""
+    if getattr(source, "is_whole_map", False):
+        text = (
+            f"{source.name}: one cloud, a map without its scans: no place is recognised by these descriptors, which "
+            "are of its stations: detect needs --assume-aligned or --before-T-after FILE"
+        )
+        warnings.warn(text, InputWarning, stacklevel=3)

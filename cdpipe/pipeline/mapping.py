@@ -27,6 +27,7 @@ from cdpipe.mapping.airborne import clear_air
 from cdpipe.mapping.counted import CountedScans
 from cdpipe.mapping.mapping import build_map, choose_keyframes
 from cdpipe.mapping.reach import require_cells_reach
+from cdpipe.mapping.scanless import warn_of_whole_map
 from cdpipe.mapping.session_check import check_session
 from cdpipe.merge.candidates import first_keyframes
 from cdpipe.model.config import PipelineConfig, load_config
@@ -52,6 +53,7 @@ def describe(
     source, folder = open_with_folder(session)
     if folder is None:
         raise InputError(f"{source.name}: descriptors are stored beside a recording: name its folder or file")
+    warn_of_whole_map(source)
     if config.regions.source == "sphere":
         descriptors = map_session(source, config).descriptors
     else:

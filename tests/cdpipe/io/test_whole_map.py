@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cdpipe import detect
-from cdpipe.core.errors import InputError
+from cdpipe import describe, detect
+from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.geometry import Float64Array, stream, transform
 from cdpipe.io.foreign import HowToRead
 from cdpipe.io.foreign.whole_map import find_stations
@@ -112,6 +112,13 @@ def test_a_merge_that_is_not_known_is_refused(tmp_path: Path) -> None:
     maps = [write(tmp_path / f"{sample}.ply", drift(sample)) for sample in (1, 2)]
     with pytest.raises(InputError, match="say --assume-aligned"):
         detect(*maps, "c2c")
+
+
+def test_descriptors_of_a_map_are_warned_of(tmp_path: Path) -> None:
+    path = write(tmp_path / "map.ply", drift(1))
+    with pytest.warns(InputWarning, match=r"map\.ply: one cloud, .* no place is recognised by these descriptors"):
+        _, stored = describe(path, "scan-context")
+    assert stored.is_file()
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), stream(1, "dust").uniform(0, 30, (500, 3))])
