@@ -16,15 +16,30 @@ from cdpipe.model.report import ChangeReport, SurfaceField
 
 # The marker, and what not every answer has: of an older one it would tell what is not in the new one. The last two are
 # written by `tunnelcd detect`.
-_OF_AN_ANSWER = ("answer.json", "surface.csv", "surface.ply", "surface.png", "answer.html")
+_OF_AN_ANSWER = ("answer.json", "surface.csv", "surface.columns.txt", "surface.ply", "surface.png", "answer.html")
+# What stands beside surface.csv, for those who have the folder alone.
+_ROWS = (
+    "One row of surface.csv is one metre of the before path and one sector of 45 degrees in which rock was measured."
+)
+SURFACE_COLUMNS = {
+    "chainage_from_m, chainage_to_m": "stretch of the before path, metres from its start",
+    "sector": "part of the section, looking along the path; on the way back from a turn on the spot still as before it",
+    "n_places": "places with a displacement",
+    "mean_displacement_m": "their mean, metres, positive into the void",
+    "largest_displacement_m": "the displacement of the largest magnitude, metres, with its sign",
+    "median_level_m": "median of their 95 % levels of detection, metres; empty where none is known",
+    "share_beyond_level": "share of them beyond their own level, 0 to 1; 0.05 where nothing moved",
+    "n_places_in_regions": "places in regions that moved",
+}
 
 
 def save_report(report: ChangeReport, folder: Path | str, method: str = "tunnelcd") -> None:
     """Write answer.json and answer.npz, regions.csv, objects.csv and objects.ply.
 
-    A report that says how far the rock moved also becomes surface.csv (`ChangeReport.to_pandas`) and surface.ply, the
-    places with their normals, displacement, level of detection and region. answer.json, which marks an answer complete,
-    goes first and is written last. What an older answer has beside these goes, too.
+    A report that says how far the rock moved also becomes surface.csv (`ChangeReport.to_pandas`), surface.columns.txt,
+    which explains its columns, and surface.ply, the places with their normals, displacement, level and region.
+    answer.json, which marks an answer complete, goes first and is written last. What an older answer has beside these
+    goes, too.
 
     Args:
         report: What `detect` returned.
@@ -47,6 +62,9 @@ def save_report(report: ChangeReport, folder: Path | str, method: str = "tunnelc
             write_ply_points(partial, np.concatenate(points), {"object": np.concatenate(owners)})
         if report.surface is not None:
             _write_table(report, "surface", folder)
+            with whole_file(folder / "surface.columns.txt") as partial:
+                told = [f"{name}: {meaning}" for name, meaning in SURFACE_COLUMNS.items()]
+                partial.write_text("\n".join([_ROWS, "", *told, ""]), encoding="utf-8")
             with whole_file(folder / "surface.ply") as partial:
                 _write_surface(partial, report.surface)
         write_answer(folder, method, report)

@@ -126,7 +126,7 @@ def detect(
     verdict = "accepted" if known is None else "known, not judged"
     print_table(f"merge: {verdict}", _evidence_table(report.evidence, config), LINE)
     files = ["answer.json", "answer.npz", "regions.csv", "objects.csv", "objects.ply"]
-    files += [] if report.surface is None else ["surface.csv", "surface.ply", "surface.png"]
+    files += [] if report.surface is None else ["surface.csv", "surface.columns.txt", "surface.ply", "surface.png"]
     print_answer(report, out, [*files, *(["answer.html"] if html else [])], config.query.threshold)
 
 

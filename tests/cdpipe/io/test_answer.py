@@ -349,6 +349,15 @@ def test_a_saved_answer_leaves_nothing_of_an_older_one(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == names
 
 
+def test_a_text_beside_surface_csv_explains_every_column(tmp_path: Path) -> None:
+    save_report(_with_surface(), tmp_path)
+    columns = [*pd.read_csv(tmp_path / "surface.csv")]
+    heads = [line.partition(":")[0] for line in (tmp_path / "surface.columns.txt").read_text().splitlines()[2:]]
+    assert ", ".join(heads).split(", ") == columns
+    guide = (Path(report_files.__file__).parents[1] / "surface" / "SURFACE.md").read_text()
+    assert all(f"| `{head.replace(', ', '`, `')}` |" in guide for head in heads)
+
+
 @pytest.mark.parametrize("broken", ["savez_compressed", "to_csv", "write_ply_points", "dumps"])
 def test_a_folder_holds_a_whole_answer_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str) -> None:
     save_report(_with_surface(), tmp_path)
