@@ -1,4 +1,8 @@
-"""Cloud-to-mesh distance (C2M): from each place to a triangle mesh of the after surface."""
+"""Cloud-to-mesh distance (C2M): from each place to a triangle mesh of the after surface.
+
+Usually the mesh is of the reference, here the before surface, and each point of the other cloud has a distance to it.
+An answer states one displacement at each place of the before surface, so here the after surface is the mesh.
+"""
 
 from __future__ import annotations
 
