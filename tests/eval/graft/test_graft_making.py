@@ -192,6 +192,7 @@ def test_every_public_recording_says_where_it_is_from(tmp_path: Path) -> None:
     assert {"conslam", "geode-metro", "hilti-2023", "min3d-underground", "ntnu-fog", "ntnu-tunnel", "subiaco"} <= set(
         adapters
     )
+    assert {adapters[name].licence for name in ("ntnu-fog", "ntnu-tunnel")} == {"BSD-3-Clause (of the repository)"}
     for name, adapter in adapters.items():
         assert adapter.url.startswith("https://")
         assert bool(adapter.sessions) != bool(adapter.unreadable)
