@@ -49,6 +49,7 @@ from eval.plans.targets import read_targets
 from eval.plans.worlds import world_slug
 from eval.running.cell_rows import ITEM_TABLES, SURFACE_TABLES, collect_tables, holds_rows
 from eval.running.results.tables import without_unusable
+from eval.tables.alarms import count_alarms
 from eval.tables.effects import effects
 from eval.tables.hardness import FILES as HARD_FILES
 from eval.tables.hardness import breaking_points, hardness_table
@@ -212,7 +213,7 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     usable = {table: without_unusable(frame) for table, frame in collected.items()}
     usable["results"] = without_costs_of_failures(usable["results"])
     tables = {
-        "summary": summarise(usable["results"], keyframes=usable["keyframes"]),
+        "summary": summarise(_with_counted_alarms(usable["results"]), keyframes=usable["keyframes"]),
         **{table: collected[table] for table in SURFACE_TABLES},
         "effects": effects(usable["results"]),
         "merge": merge_table(usable["results"], read_targets(run.stored_provenance())),
@@ -235,6 +236,12 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     finally:
         remove(hidden)
     return results
+
+
+def _with_counted_alarms(results: pd.DataFrame) -> pd.DataFrame:
+    if "is_alarm" not in results or results["is_alarm"].isna().all():  # of a plan that ends at the merge
+        return results
+    return results.assign(is_alarm=count_alarms(results))
 
 
 def current_results(run: RunFolder, earlier: Mapping[str, Any], now: Mapping[str, Any]) -> pd.DataFrame | None:

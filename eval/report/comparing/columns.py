@@ -9,13 +9,11 @@ import pandas as pd
 
 from cdpipe.core.geometry import Float64Array
 from eval.report.pooled import POOLED
+from eval.tables.alarms import count_alarms, may_be_refused
 from eval.tables.columns import RESULT_COLUMNS, Column, select, share, significant
 from eval.tables.merge_table import RULES, is_within_target, kinds
 from eval.tables.rows import numbers, with_domain, without_costs_of_failures
-from eval.tables.targets import is_unchanged_pair
 
-# kinds of pair at which a refusal can be right
-_REFUSABLE = ("smooth", "disjoint")
 _P95 = replace(*select(RESULT_COLUMNS, "merge_error_m"), key="merge_error_m_p95",
                heading="merge error, 95th percentile [m]")  # fmt: skip
 COMPARED = (
@@ -53,7 +51,7 @@ def figures_of(results: pd.DataFrame) -> pd.DataFrame:
         The same rows with `scenario`, `seed`, `variant`, `domain` and a number for each compared column that is there.
     """
     kind = kinds(results)
-    answered = np.where(np.isin(kind, _REFUSABLE), np.nan, (results["status"] == "ok").to_numpy(dtype=np.float64))
+    answered = np.where(may_be_refused(results), np.nan, (results["status"] == "ok").to_numpy(dtype=np.float64))
     within = np.where(np.isin(kind, list(RULES)), is_within_target(results).astype(np.float64), np.nan)
     columns = {
         "scenario": results["scenario"].astype(str).to_numpy(),
@@ -66,10 +64,8 @@ def figures_of(results: pd.DataFrame) -> pd.DataFrame:
     results = without_costs_of_failures(results)
     stored = [column.key for column in COMPARED if column.key not in (*columns, POOLED) and column.key in results]
     figures = {**columns, **{key: _as_numbers(results, key) for key in stored}}
-    if "is_alarm" in stored and "is_unchanged_pair" in results:
-        # who refuses the pairs on which he would cry wolf is not silent, nor is who answers objects without regions
-        cries = (answered == 0) | (numbers(results, "n_objects") > 0)
-        figures["is_alarm"] = np.where(is_unchanged_pair(results) & cries, 1.0, figures["is_alarm"])
+    if "is_alarm" in stored:
+        figures["is_alarm"] = count_alarms(results)
     return pd.DataFrame(figures)
 
 
