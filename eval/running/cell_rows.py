@@ -19,7 +19,7 @@ IDENTITY = ("scenario", "seed", "variant")
 TEXT_COLUMNS = {
     "scenario", "variant", "preset", "family", "pair_kind", "domain", "commit", "status", "error", "session", "name",
     "kind", "prop_kind", "group", "why_not", "matched_kind", "outcome", "found_changes",
-    "found_changes_proposed", "checkpoints", "extras", "odometry_before", "odometry_after", "sensor_profile",
+    "found_changes_proposed", "twins", "checkpoints", "extras", "odometry_before", "odometry_after", "sensor_profile",
 }  # fmt: skip
 _NAMED = {"scenario": str, "seed": int, "variant": str}
 ITEM_TABLES = ("changes", "regions", "objects", "keyframes")

@@ -14,6 +14,7 @@ from eval.core.domains import is_change_in_distribution
 from eval.scoring.object_metrics import ObjectMatches
 from eval.scoring.object_sizes import SizeErrors
 from eval.scoring.region_metrics import RegionScores
+from eval.scoring.twins import list_twins
 from eval.truth.ground_truth import GroundTruth
 
 _NAN = float("nan")
@@ -28,7 +29,7 @@ def make_change_rows(
 ) -> list[dict[str, Any]]:
     """Return a row of changes.csv for every change, observable or not."""
     rows = []
-    objects, sizes = scored
+    (objects, sizes), twins = scored, list_twins(truth)
     for index, change in enumerate(truth.pair.changes):
         fields = {name: value for name, value in asdict(change).items() if name != "world_T_object"}
         matched = int(objects.matched_object[index])
@@ -47,6 +48,7 @@ def make_change_rows(
                 "seen_hull_volume_m3": hull_volume_m3(truth.points_odom(index)),
                 "range_m": truth.range_m(index),
                 "is_in_distribution": is_change_in_distribution(truth.pair.family, change.prop_kind),
+                "twins": ";".join(map(str, twins[index])),
             }
         )
     return rows

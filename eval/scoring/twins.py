@@ -49,6 +49,19 @@ def list_drawn_labels(truth: GroundTruth) -> tuple[Label, ...]:
     )
 
 
+def list_twins(truth: GroundTruth) -> list[list[int]]:
+    """Return for each of C changes the ids of those among which labels are exchanged; none where its label is fixed."""
+    changes, drawn = truth.pair.changes, list_drawn_labels(truth)
+    found: list[list[int]] = [[] for _ in changes]
+    for before, after, _ in _find_groups(truth, drawn):
+        members = sorted((*before, *after))
+        if len(members) == 2 and drawn[before[0]].other == after[0]:
+            continue  # both halves of one move
+        for index in members:
+            found[index] = [changes[other].id for other in members if other != index]
+    return found
+
+
 def label_changes(
     objects: Sequence[ChangedObject], matched_object: Int64Array, truth: GroundTruth
 ) -> tuple[Label, ...]:

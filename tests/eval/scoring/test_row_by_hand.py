@@ -257,6 +257,7 @@ def test_the_changes(case: CaseScore) -> None:
         "seen_hull_volume_m3": [1.0, 1.0, 0.0],
         "range_m": [2.5, 3.5, NAN],
         "is_in_distribution": [True, True, True],
+        "twins": ["", "", ""],
     }.items():
         found = [row[name] for row in case.changes]
         assert list(map(type, found)) == list(map(type, values)), name
@@ -267,7 +268,7 @@ def test_the_changes(case: CaseScore) -> None:
     own = {"is_found", "best_region", "iou_point", "iou_voxel", "iou_box", "matched_object", "matched_kind"}
     own |= {"is_kind_right", "displacement_error_m", "volume_error_share", "n_truth_cells", "seen_hull_volume_m3"}
     of_change = {name for name in change(1).__dataclass_fields__ if name != "world_T_object"}
-    assert set(case.changes[0]) == own | of_change | {"range_m", "is_in_distribution"}
+    assert set(case.changes[0]) == own | of_change | {"range_m", "is_in_distribution", "twins"}
 
 
 def test_the_regions(case: CaseScore) -> None:

@@ -12,7 +12,7 @@ from cdpipe.core.geometry import make_pose
 from cdpipe.model.report import ChangedObject
 from eval.scoring.object_metrics import judge_kinds, match_objects
 from eval.scoring.object_sizes import compute_size_errors, find_true_displacements_map
-from eval.scoring.twins import Label, label_changes, list_drawn_labels
+from eval.scoring.twins import Label, label_changes, list_drawn_labels, list_twins
 from eval.truth.ground_truth import GroundTruth
 from sim.session.truth import Change
 from tests.eval.scoring.test_object_sizes import WIDTH, change_at, thing, truth_of
@@ -86,6 +86,14 @@ def test_of_two_equal_barrels_either_may_have_been_carried() -> None:
     np.testing.assert_allclose(errors.displacement_m, [NAN, 0.0, 0.0], atol=1e-9)
     errors = compute_size_errors(answer(truth, [(0, 1)]), matched(truth, answer(truth, [(0, 1)])), truth)
     np.testing.assert_allclose(errors.displacement_m, [9.0, 9.0, NAN], atol=1e-9)
+
+
+def test_the_changes_among_which_labels_are_exchanged_are_listed() -> None:
+    assert list_twins(two_barrels()) == [[2, 3], [1, 3], [1, 2]]
+    assert list_twins(two_barrels(height_m=0.5)) == [[], [], []]  # A's own two halves are no twins
+    changes = [gone(4, "A", 2.0), come(7, "B", 9.0), gone(8, "C", 5.0)]
+    truth = truth_of(changes, props=[prop("A"), prop("B"), prop("C", 0.5)])
+    assert list_twins(truth) == [[7], [4], []]
 
 
 def test_one_of_them_was_carried_all_the_same() -> None:
