@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from textwrap import shorten, wrap
@@ -17,11 +18,15 @@ from eval.plans.files import plan_files, read_plan
 from eval.tables.columns import RESULT_COLUMNS
 from scenarios import prop_names
 from scenarios.catalogue import describe_prop, family_files
+from scenarios.schema.keys import list_keys
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
 _UNITS = {"m": "m", "m2": "m2", "m3": "m3", "mm": "mm", "s": "s", "deg": "deg", "rad": "rad"}
+_WORLD_UNITS = {"mps": "m/s", "hz": "Hz", "percent": "%", "share": "share"}
+_RATE = re.compile(r"(?:(?:^|_)([a-z]+)_)?per_(100m|m[23]?)$")  # of the last part of a key, as yaw_deg_per_m
+WITH_DEFAULTS = ("settings", "world")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +56,8 @@ def describe_entry(entry: Entry, others: Sequence[Entry], columns: int) -> str:
 
 def describe_setting(entry: Entry, columns: int) -> list[str]:
     """Return the lines about a setting: key, default and unit or values; below them what it means."""
-    default = "true" if entry.default is True else "false" if entry.default is False else entry.default
+    words = {"True": "true", "False": "false", "None": "null"}
+    default = words.get(str(entry.default), entry.default)
     indent = "    "
     head = f"{entry.name} = {default}".rstrip() + (f"  [{entry.unit}]" if entry.unit else "")
     return [head, *wrap(entry.description, columns, initial_indent=indent, subsequent_indent=indent)]
@@ -94,6 +100,21 @@ def _unit(key: str, field: FieldInfo) -> str:
     return {int: "number", float: "factor", str: "text", dict: "keys and values"}.get(type(field.default), "")
 
 
+def _world() -> Iterable[Entry]:
+    """Yield the keys of a scenario; a key that must be given has no default."""
+    for key in list_keys():
+        default = "" if key.field.is_required() else key.field.get_default(call_default_factory=True)
+        shown = [*default] if isinstance(default, tuple) else default
+        yield Entry(key.name, key.meaning, shown, _world_unit(key.name, key.field))
+
+
+def _world_unit(key: str, field: FieldInfo) -> str:
+    """Return the unit of a key of a scenario, by the end of its name; else its values."""
+    if rate := _RATE.search(key.rpartition(".")[2]):
+        return f"{rate[1] or 1}/{rate[2]}"
+    return _WORLD_UNITS.get(key.rpartition("_")[2]) or _unit(key, field)
+
+
 def _limits(field: FieldInfo) -> list[Any]:
     return [each for each in field.metadata if type(each).__name__ in ("Ge", "Le")]
 
@@ -127,4 +148,5 @@ _LISTED: dict[str, Callable[[], Iterable[Entry]]] = {
     "sensors": lambda: (Entry(name, _one_line(describe_profile(name))) for name in profile_names()),
     "recordings": _recordings,
     "settings": _settings,
+    "world": _world,
 }

@@ -50,9 +50,9 @@ class Odometry(GrownSettings):
 
     newer: ClassVar[frozenset[str]] = frozenset({*FITTED_WALK, "file"})
 
-    source: Literal["drift", "kiss-icp", "random-walk", "file"] = "drift"
-    translation_percent: NotNegative = 0.0
-    yaw_deg_per_100m: NotNegative = 0.0
+    source: Literal["drift", "kiss-icp", "random-walk", "file"] = "drift"  # what the poses come from
+    translation_percent: NotNegative = 0.0  # of drift: error of the way; with yaw_deg_per_100m 0, too, the truth
+    yaw_deg_per_100m: NotNegative = 0.0  # of drift: error of the heading
     scale_percent: NotNegative | None = None  # standard deviation of the error of scale
     scale_length_m: Positive | None = None  # correlation length of the error of scale
     yaw_deg_per_m: NotNegative | None = None  # standard deviation of the error of the yaw rate

@@ -33,7 +33,7 @@ class Platform(GrownSettings):
 
     newer: ClassVar[frozenset[str]] = frozenset({"mount_yaw_deg", "mount_pitch_deg", "gait"})
 
-    kind: Literal["ground_robot", "quadrotor", "handheld", "legged"] = "ground_robot"
+    kind: Literal["ground_robot", "quadrotor", "handheld", "legged"] = "ground_robot"  # what carries the sensor
     sensor_height_m: Positive = 0.8  # above the floor
     speed_mps: Positive = 1.0
     speed_variation: Annotated[float, Field(ge=0, le=0.5)] = 0.0  # standard deviation, as a share of the speed

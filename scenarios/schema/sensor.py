@@ -19,8 +19,8 @@ class Sensor(GrownSettings):
 
     newer: ClassVar[frozenset[str]] = frozenset({"returns", "retroreflectors", "glass"})
 
-    profile: str = "os1-32-nominal"
-    mode: str | None = None  # left out: the profile's own, 1024x10 if shipped
+    profile: str = "os1-32-nominal"  # a name of `tunnelcd list sensors`, or a metadata .json
+    mode: str | None = None  # columns x revolutions per second; left out: the profile's own, 1024x10 if shipped
     rolling_scan: bool = True  # a pose per column; off: the sensor stands still during each revolution
     range_noise: bool = True  # by range and by the strength of the return
     dropouts: bool = True  # weak returns are lost: reflectivity, incidence, range
@@ -31,7 +31,7 @@ class Sensor(GrownSettings):
     glass: bool = False  # panes let light through and mirror it; off: they are dark walls
     range_step_mm: Literal[1, 8] = 1  # 8: the vendor's low-bandwidth packets
     max_range_m: Annotated[float, Field(gt=0, le=524)] = 120.0  # the vendor's range field: 19 bits of millimetres
-    min_range_m: NotNegative = 0.3
+    min_range_m: NotNegative = 0.3  # nearer returns are lost
 
     @property
     def n_returns(self) -> int:

@@ -41,7 +41,7 @@ class SessionPlan(GrownSettings):
 
     newer: ClassVar[frozenset[str]] = frozenset({"air", "sensor", "platform"})
 
-    route: tuple[str, ...] = ()
+    route: tuple[str, ...] = ()  # the nodes that it drives through
     trajectory: str | None = None  # TUM file of world_T_sensor, instead of a route; from the scenario's file
     lateral: SignedShare = 0.0  # which line: -1 right, +1 left, of the width the platform leaves free
     start_m: NotNegative = 0.0  # path left out at the start of the route

@@ -156,17 +156,19 @@ def _tell_files(written: list[Path]) -> None:
 
 def list_command(
     what: Annotated[
-        Literal["scenarios", "props", "plans", "presets", "methods", "metrics", "sensors", "recordings", "settings"]
+        Literal[
+            "scenarios", "props", "plans", "presets", "methods", "metrics", "sensors", "recordings", "settings", "world"
+        ]
         | None,
-        typer.Argument(help="this alone, with one-line descriptions; of settings with default and unit"),
+        typer.Argument(help="this alone, described; settings, and world: keys of --world, with default and unit"),
     ] = None,
     as_json: AsJson = False,
     out: JsonFile = None,
 ) -> None:
-    """List scenarios, props, plans, presets, methods, metrics, sensors; or one of these, or the settings, described."""
+    """List scenarios, props, plans, presets, methods, metrics, sensors; one of these, settings, or keys of --world."""
     from dataclasses import asdict
 
-    from eval.cli.listing import describe_entry, describe_setting, list_entries
+    from eval.cli.listing import WITH_DEFAULTS, describe_entry, describe_setting, list_entries
 
     require_json_file(out)
     if what is None:
@@ -177,13 +179,14 @@ def list_command(
         for title, of_kind in names.items():
             echo(f"{title}:", *(f"  {name}" for name in of_kind))
         return
-    columns = ["name", "default", "unit", "description"] if what == "settings" else ["name", "description"]
+    has_defaults = what in WITH_DEFAULTS
+    columns = ["name", "default", "unit", "description"] if has_defaults else ["name", "description"]
     entries = list_entries(what)
     tell_json([{column: asdict(entry)[column] for column in columns} for entry in entries], as_json=as_json, file=out)
     if as_json:
         return
     for entry in entries:
-        echo(*(describe_setting(entry, LINE) if what == "settings" else [describe_entry(entry, entries, line_width())]))
+        echo(*(describe_setting(entry, LINE) if has_defaults else [describe_entry(entry, entries, line_width())]))
 
 
 _TITLES = {

@@ -18,6 +18,7 @@ from eval.cli.doctor import Finding
 from eval.core.terminal.printing import echo_json
 from eval.plans.files import plan_names
 from scenarios import scenario_names
+from scenarios.schema import Odometry, Platform, Scenario, Sensor, Simulation
 
 Command = Callable[..., tuple[int, str, str]]
 
@@ -44,6 +45,29 @@ def test_settings_come_with_default_unit_and_meaning(command: Command) -> None:
     code, out, _ = command("list", "settings")
     assert "map.voxel_m = 0.2  [m]\n    cell of the thinned map\n" in out
     assert max(map(len, out.splitlines())) <= 90
+
+
+def test_keys_of_the_world_come_with_default_unit_and_meaning(command: Command) -> None:
+    code, out, _ = command("list", "world", "--json")
+    assert code == 0
+    rows = {row["name"]: row for row in json.loads(out)}
+    parts = {"sensor": Sensor, "platform": Platform, "before.odometry": Odometry, "sim": Simulation}
+    assert {f"{name}.{key}" for name, part in parts.items() for key in part.model_fields} <= set(rows)
+    assert {name.partition(".")[0] for name in rows} == set(Scenario.model_fields)
+    assert rows["platform.scan_spacing_m"] == {
+        "name": "platform.scan_spacing_m", "default": 0.25, "unit": "m",
+        "description": "path between the recorded revolutions",
+    }  # fmt: skip
+    units = {"platform.speed_mps": "m/s", "before.odometry.yaw_deg_per_m": "deg/m", "sensor.sub_rays": "1 | 7 | 19",
+             "before.air.dust.mg_per_m3": "mg/m3", "before.odometry.scale_percent": "%", "sensor.glass": "true | false",
+             "before.odometry.yaw_deg_per_100m": "deg/100m", "tunnel.floor.stones.per_m2": "1/m2"}  # fmt: skip
+    assert {name: rows[name]["unit"] for name in units} == units
+    assert (rows["before.trajectory"]["default"], rows["after"]["default"]) == (None, "")
+    assert rows["props.NAME.to"]["description"].endswith("keys as of props.NAME.place")
+    assert rows["tunnel.variation"]["description"] == "Slow change of width and of height along every drift"
+    code, out, _ = command("list", "world")
+    assert "platform.scan_spacing_m = 0.25  [m]\n    path between the recorded revolutions\n" in out
+    assert "before.trajectory = null\n" in out and max(map(len, out.splitlines())) <= 90
 
 
 @pytest.mark.parametrize(("kind", "names"), [("scenarios", scenario_names), ("plans", plan_names)])
