@@ -49,7 +49,15 @@ from eval.report.summary import HEADLINES, draw_summary
 from eval.report.surface.surface import SURFACE_COLUMNS, draw_surface
 from eval.report.tables import Cell, Table, results_table, to_csv, unchanged_table
 from eval.running.results.cases import first_seed, named_variants, scenarios
-from eval.running.results.run_data import RunData, ends_at_merge, figures_of_plan, plan_name, read_run, shown_variant
+from eval.running.results.run_data import (
+    RunData,
+    ends_at_merge,
+    figures_of_plan,
+    plan_name,
+    read_run,
+    shown_variant,
+    without_told_merges,
+)
 from eval.running.results.sides import Side, check_extras, check_versions, is_contended
 from eval.running.results.values import flag, select_rows, text
 from eval.running.runfolder import read_json
@@ -113,11 +121,13 @@ def write_page(
 def _draw(data: RunData, views: Views, kept: KeptPage, *, is_slim: bool) -> dict[str, str | bytes]:
     """Return every file of a page by its name."""
     targets = read_targets(data.provenance)
-    merges = merge_table(pd.DataFrame(list(data.results)), targets)
-    content = _about(data, merges)
+    every = pd.DataFrame(list(data.every_result))
+    data, merging = without_told_merges(data)
+    merges = merge_table(pd.DataFrame(list(merging.results)), targets)
+    content = _about(data, merges) | {"merge": draw_merge(merging)}
     files: dict[str, str | bytes] = {**latex_tables(data)}
     if len(merges):
-        files["merge.csv"] = merge_table(pd.DataFrame(list(data.every_result)), targets).to_csv(index=False)
+        files["merge.csv"] = merge_table(every, targets).to_csv(index=False)
     if not ends_at_merge(data):
         hardness = draw_hardness(data)
         if hardness is not None:
@@ -170,7 +180,6 @@ def _about(data: RunData, merges: pd.DataFrame) -> dict[str, Any]:
         "title": write_title(data),
         "answer": write_answer(data, merges),
         "summary": draw_summary(data, merges),
-        "merge": draw_merge(data),
         "ends_at_merge": ends_at_merge(data),
         "hardness": None,
         "columns": MERGE_COLUMNS,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -116,6 +117,34 @@ def read_run(run: Path) -> RunData:
         )
     tables = results, items["changes"], items["regions"]
     return RunData(RunFolder(run), *tables, provenance, tuple(missing), tuple(left_out))
+
+
+def read_told_merges(run: RunFolder) -> dict[str, str]:
+    """Return what told each method of an evaluation its merge, "the truth" or "tunnelcd"; nothing of other methods."""
+    found = (read_json(path) for path in sorted(run.path.glob("evaluations/*/evaluation.json")))
+    sources = {"given": "the truth", "ours": "tunnelcd"}
+    merges = {str(each.get("name")): str(each.get("merge")) for each in found}
+    return {name: sources[merge] for name, merge in merges.items() if merge in sources}
+
+
+def without_told_merges(data: RunData) -> tuple[RunData, RunData]:
+    """Return a run in which methods that were told their merge have no merge error, and the run without these methods.
+
+    A sentence of `left_out` says so. Where no method merged by itself none is compared, and all stay as they are.
+    """
+    told = read_told_merges(data.folder)
+    variants = {str(row["variant"]) for row in data.every_result}
+    notes = tuple(f"merge given: {name} was told the merge by {told[name]}, so its merge errors are left out."
+                  for name in sorted(variants & told.keys()))  # fmt: skip
+    own = tuple(row for row in data.results if row["variant"] not in told)
+    if not notes or not own:
+        return data, data
+    shown = tuple(_blank_merge(row) if row["variant"] in told else row for row in data.results)
+    return replace(data, results=shown, left_out=(*data.left_out, *notes)), replace(data, results=own)
+
+
+def _blank_merge(row: Row) -> Row:
+    return {name: math.nan if name.startswith("merge_error_") else value for name, value in row.items()}
 
 
 def stored_table(data: RunData, name: str) -> pd.DataFrame:

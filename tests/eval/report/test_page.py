@@ -267,6 +267,20 @@ def test_every_value_of_the_results_stands_in_its_cell_and_the_best_is_bold(page
     assert bold == {"paper": [], "tunnelcd": [2, 3, 5, 8, 10, 11], "voxel-diff": [1, 3, 4, 6, 7], "random-regions": []}
 
 
+def test_a_method_that_was_told_the_merge_has_no_merge_error_and_the_page_says_why(run: Path) -> None:
+    folder = run / "evaluations" / "tunnelcd"
+    folder.mkdir(parents=True)
+    (folder / "evaluation.json").write_text('{"name": "tunnelcd", "merge": "given"}')
+    text = write_page(run, views="none").read_text()
+    assert "merge given: tunnelcd was told the merge by the truth, so its merge errors are left out." in text
+    rows = {row[0][0]: row for row in tables_of(run / "index.html")["preset / region recall"][2:5]}
+    assert texts(rows["tunnelcd"])[9:11] == ["-", "-"]
+    # of the others the smaller one is the best
+    assert {name: row[10] for name, row in rows.items() if name != "tunnelcd"} == {
+        "paper": ("0.034", True), "voxel-diff": ("0.036", False),
+    }  # fmt: skip
+
+
 def test_the_unchanged_pair_has_its_own_rows(page: Path) -> None:
     table = tables_of(page)["preset / alarm"]
     assert [texts(row) for row in table[2:]] == [

@@ -1,5 +1,7 @@
 """A run folder whose large tables are compressed reads like the folder that the run wrote."""
 
+import json
+import math
 from pathlib import Path
 
 import pandas as pd
@@ -7,7 +9,7 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from eval.report.page import write_page
-from eval.running.results.run_data import read_run
+from eval.running.results.run_data import read_run, without_told_merges
 from eval.scoring.scoring import METRICS_VERSION
 
 IDENTITY = {"scenario": "regions/narrow", "variant": "tunnelcd"}
@@ -40,6 +42,23 @@ def test_compressed_tables_give_the_same_rows_and_the_same_page(tmp_path: Path) 
     assert first.missing == second.missing
     pages = [write_page(run).read_text().replace(str(run), "run") for run in (plain, compressed)]
     assert pages[0] == pages[1]
+
+
+def test_merge_errors_of_a_method_that_was_told_its_merge_are_left_out(tmp_path: Path) -> None:
+    run = written(tmp_path / "run", ".csv")
+    rows = [{**row, "variant": name, "merge_error_m": 0.0} for name in ("mine", "a") for row in TABLES["results"]]
+    pd.DataFrame(rows).to_csv(run / "results.csv", index=False)
+    folder = run / "evaluations" / "mine"
+    folder.mkdir(parents=True)
+    for merge, n_told in (("own", 0), ("ours", 2)):
+        (folder / "evaluation.json").write_text(json.dumps({"name": "mine", "merge": merge}))
+        shown, merging = without_told_merges(read_run(run))
+        assert [math.isnan(row["merge_error_m"]) for row in shown.results] == [n_told > 0] * 2 + [False] * 2
+        assert len(merging.results) == 4 - n_told
+        assert sum("mine was told the merge by tunnelcd" in note for note in shown.left_out) == (n_told > 0)
+    pd.DataFrame(rows[:2]).to_csv(run / "results.csv", index=False)  # alone it is compared with nothing
+    shown, merging = without_told_merges(read_run(run))
+    assert [row["merge_error_m"] for row in shown.results] == [0.0, 0.0] and len(merging.results) == 2
 
 
 def test_what_a_run_wrote_comes_before_a_compressed_copy(tmp_path: Path) -> None:
