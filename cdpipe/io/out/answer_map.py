@@ -122,12 +122,12 @@ def _distance(points: Float64Array, tree: cKDTree) -> npt.NDArray[np.float32]:
 
 def _displacement(points: Float64Array, instance: Int32Array, report: ChangeReport) -> npt.NDArray[np.float32]:
     found = np.full(len(points), np.nan, np.float32)
-    measured = [] if report.surface is None else np.flatnonzero(np.isfinite(report.surface.displacement_m))
-    if report.surface is not None and len(measured):
+    if report.surface is not None:
+        measured = np.flatnonzero(np.isfinite(report.surface.displacement_m))
         tree = cKDTree(report.surface.points_map[measured])
         away_m, nearest = tree.query(points, distance_upper_bound=_NEAR_M)
         is_near = np.isfinite(away_m) & (instance == 0)
-        found[is_near] = report.surface.displacement_m[measured][np.asarray(nearest)[is_near]]
+        found[is_near] = report.surface.displacement_m[measured[np.asarray(nearest)[is_near]]]
     for index, item in enumerate(report.objects):
         moved_m = np.nan if item.displacement_map is None else float(np.linalg.norm(item.displacement_map))
         found[instance == index + 1] = moved_m
