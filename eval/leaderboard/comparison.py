@@ -62,14 +62,13 @@ def compare_with_reference(results: pd.DataFrame, name: str, references: Sequenc
     Args:
         results: Rows of results.csv of the method.
         name: The method.
-        references: Where reference rows are; of a method that several have, the first counts. Rows under `name` are no
-            reference: they may be of another method that is called the same.
+        references: Where reference rows are; of a method that several have, the first with rows of these pairs counts.
+            Rows under `name` are no reference: they may be of another method that is called the same.
         calls: How the call about each pair ended, by (scenario, seed).
     """
     own = take_figures(results)
     references = [take_other_methods(data, name) for data in references]
-    others = {variant: rows.loc[rows.index.intersection(own.index)] for variant, rows in list_variants(references)}
-    others = {variant: rows for variant, rows in others.items() if len(rows)}
+    others = dict(list_variants(references, own.index))
     shared = own.index if not others else own.index[own.index.isin(_union(others))]
     rows, paired = [], []
     for part, members in part_pairs(own.loc[shared]).items():
@@ -169,13 +168,17 @@ def part_pairs(figures: pd.DataFrame) -> dict[str, pd.Index[Any]]:
     return found if len(found) > 1 else {"": figures.index}
 
 
-def list_variants(references: Sequence[RunData]) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield each method of some runs with its figures by pair; of a method that several have, those of the first."""
+def list_variants(references: Sequence[RunData], pairs: pd.Index[Any]) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield each method that some runs have rows of about these pairs with its figures by pair.
+
+    Of a method of several runs, those of the first that has such rows.
+    """
     seen: set[str] = set()
     for data in references:
         if not data.results:
             continue
         found = take_figures(pd.DataFrame(list(data.results)))
+        found = found.loc[found.index.isin(pairs)]
         for variant, rows in found.groupby("variant", sort=False):
             if variant not in seen:
                 yield str(variant), rows

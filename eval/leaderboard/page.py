@@ -125,7 +125,8 @@ def _make_boards(group: Sequence[CheckedFile], reference: Path | None) -> Iterat
         rows = [(summarise_figures(name, found.loc[pairs]), _MERGES[each.content.merge], False)
                 for (name, found), each in zip(own.items(), group, strict=True)]  # fmt: skip
         # a run in which a method was evaluated holds its rows, too
-        references = [(name, found) for name, found in _list_references(data, pairs) if name not in own]
+        variants = list_variants([] if data is None else [data], pairs)
+        references = [(name, found) for name, found in variants if name not in own]
         rows += [(summarise_figures(name, found), merges.get(name, ""), True) for name, found in references]
         rows.sort(key=lambda row: _place(row[0]))
         told = [
@@ -143,13 +144,6 @@ def take_rows(each: CheckedFile) -> pd.DataFrame:
     name = each.content.plan
     kinds = {world.label: world.pair_kind for world in load_plan(name).worlds} if name in plan_names() else {}
     return pd.DataFrame([{**pair.row, "pair_kind": kinds.get(pair.scenario, "")} for pair in each.content.pairs])
-
-
-def _list_references(data: RunData | None, pairs: pd.Index[Any]) -> Iterator[tuple[str, pd.DataFrame]]:
-    for name, found in list_variants([] if data is None else [data]):
-        kept = found.loc[found.index.intersection(pairs)]
-        if len(kept):
-            yield name, kept
 
 
 def _line(row: dict[str, Any], merge: str, is_reference: bool) -> Line:

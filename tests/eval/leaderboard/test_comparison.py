@@ -119,6 +119,13 @@ def test_the_first_place_that_has_a_method_counts(tmp_path: Path) -> None:
     assert found.table["region_recall"].tolist()[2] == 0.0
 
 
+def test_rows_of_a_method_about_other_pairs_hide_none_of_a_later_place(tmp_path: Path) -> None:
+    places = [read(tmp_path / "1", table((7, 8, 9))), read(tmp_path / "2", table())]
+    found = compare_with_reference(own(table()), "mine", places, {})
+    assert found.table["method"].tolist() == ["mine", "tunnelcd", "a"]
+    assert found.table["n_pairs"].tolist() == [3, 3, 3]
+
+
 def test_a_reference_of_the_same_name_is_not_shown_as_the_method(tmp_path: Path) -> None:
     other = read(tmp_path / "theirs", table().assign(region_recall=0.9))
     found = compare_with_reference(own(table()), "mine", [other], {})
