@@ -161,8 +161,8 @@ def _take_over(run: RunFolder, method: Method, plan: Plan, pairs: Sequence[Pair]
                 "--force, which answers all pairs again"
             )
     if force:
-        is_changed = _remove_others(run, method.name, digest_method(document))
-        if is_changed:  # no table holds the rows of another method while this one answers
+        is_changed = _remove_stale(run, method.name, digest_method(document), pairs)
+        if is_changed:  # no table holds the rows of another call while this one answers
             _renew_tables(run)
     write_json(path, document.model_dump(mode="json"))
     return document
@@ -177,21 +177,26 @@ def _renew_tables(run: RunFolder) -> None:
         remove(table)
 
 
-def _remove_others(run: RunFolder, name: str, called: str) -> bool:
-    """Remove the rows, answers and comparisons under a name that are not of the method with this digest.
+def _remove_stale(run: RunFolder, name: str, called: str, pairs: Sequence[Pair]) -> bool:
+    """Remove the rows, answers and comparisons under a name about pairs that are asked again.
 
-    Those of other plans go as well. Tells whether there were any.
+    Those that are not of the method with this digest go as well, also of other plans. After an interrupt nothing is
+    left that would count as answered now. Tells whether there were any.
     """
     calls, is_changed = evaluation_folder(run, name), False
+    asked = {call_path(run, name, pair.name, pair.seed) for pair in pairs}
+
+    def is_stale(path: Path) -> bool:
+        call = None if path in asked else read_call_file(path)
+        return call is None or call.method_digest != called
+
     for kind, entry in (("cells", f"{path_part(name)}.json"), ("answers", path_part(name))):
         for pair in run.path.glob(f"{kind}/*/*"):
-            call = read_call_file(calls / pair.parent.name / f"{pair.name}.json")
-            if (call is None or call.method_digest != called) and (pair / entry).exists():
+            if (pair / entry).exists() and is_stale(calls / pair.parent.name / f"{pair.name}.json"):
                 remove(pair / entry)
                 is_changed = True
     for path in calls.glob("*/*.json"):
-        call = read_call_file(path)
-        if call is None or call.method_digest != called:
+        if is_stale(path):
             remove(path)
     if is_changed:
         for path in calls.glob("*.csv"):

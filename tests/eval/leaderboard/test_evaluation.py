@@ -148,6 +148,17 @@ def test_after_an_interrupted_force_no_answer_of_the_old_command_is_kept(evaluat
     assert rows_of(evaluator)["t_cd_s"].tolist() == [0.7, 0.7]
 
 
+def test_after_an_interrupted_force_no_earlier_answer_of_the_same_command_is_kept(evaluator: Evaluator) -> None:
+    calls = evaluator.run.path.parent / "calls"
+    counting = GOOD + f"Path({str(calls)!r}).open('a').write('x')\n"
+    evaluator.evaluate(counting)
+    with pytest.raises(KeyboardInterrupt):
+        evaluator.evaluate(counting, force=True, progress=Interrupted())
+    assert not [*evaluator.run.path.glob("*.csv")]
+    outcome = evaluator.evaluate(counting)
+    assert (outcome.n_done, outcome.n_kept, len(calls.read_text())) == (1, 1, 4)
+
+
 def test_force_on_a_part_of_the_plan_leaves_no_row_of_the_old_command(evaluator: Evaluator) -> None:
     evaluator.evaluate()
     evaluator.evaluate(name="other")
