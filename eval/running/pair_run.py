@@ -36,7 +36,7 @@ from eval.oracles.regions import regions_by_truth
 from eval.plans.variants import Cell
 from eval.running.cell_file import cell_document
 from eval.running.runfolder import RunFolder, write_json
-from eval.running.scaling.keeping import Keep, dropped_file, read_dropped, require_same_bytes
+from eval.running.scaling.keeping import Keep, dropped_file, is_dropped, read_dropped, require_same_bytes
 from eval.running.stages.pair_stages import PairStages
 from eval.running.stages.stage_cache import open_cache
 from eval.scoring.scoring import METRICS_VERSION, CaseScore, describe_recording, score_stored
@@ -200,6 +200,13 @@ def is_finished(run: RunFolder, each: Todo) -> bool:
             "or name another run folder"
         )
     return bool(stored["key"] == each.key and stored["row"].get("metrics_version") == METRICS_VERSION)
+
+
+def is_pair_dropped(run: RunFolder, pair: Pair) -> bool | None:
+    """Tell whether removed sessions were of this world; None where none were removed, or it cannot be told."""
+    if pair.scenario is None:
+        return None
+    return is_dropped(run, pair.name, pair.seed, pair.scenario.model_dump(mode="json"), pair.files)
 
 
 def pair_lock(run: RunFolder, pair: Pair) -> AbstractContextManager[None]:

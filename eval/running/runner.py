@@ -26,10 +26,10 @@ from eval.core.terminal.progress import RunProgress, Silent
 from eval.plans.cells import expand_cells
 from eval.plans.plan import Plan
 from eval.plans.variants import Cell
-from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Tools, pair_lock
+from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Tools, is_pair_dropped, pair_lock
 from eval.running.run_workers import remove_traces, run_on_workers
 from eval.running.runfolder import RunFolder, current_results, keep_makers, write_json, write_tables
-from eval.running.scaling.keeping import Keep, drop_pair, dropped_file, is_dropped, remove_leftovers
+from eval.running.scaling.keeping import Keep, drop_pair, dropped_file, remove_leftovers
 from eval.running.scaling.merged_provenance import resume_provenance
 from eval.running.scaling.mirror import Mirror
 from eval.running.scaling.remaking import remake_pair
@@ -272,7 +272,7 @@ def _remove_stale(run: RunFolder, pair: Pair, force: bool) -> None:
     """Remove what is about to run again, so that no table holds it if the run is interrupted."""
     if not pair.todo:
         return
-    if force or not (_is_simulated(run.pair(pair.name, pair.seed), pair) or _is_dropped(run, pair)):
+    if force or not (_is_simulated(run.pair(pair.name, pair.seed), pair) or is_pair_dropped(run, pair)):
         _remove_pair(run, pair)
         remove(dropped_file(run, pair.name, pair.seed))
     for each in pair.todo:
@@ -281,23 +281,17 @@ def _remove_stale(run: RunFolder, pair: Pair, force: bool) -> None:
 
 
 def _remove_pair(run: RunFolder, pair: Pair) -> None:
-    """Remove a pair and its maps, and where it is of another world every row and answer about that.
+    """Remove a pair and its maps, and where it is of another world every row, answer and record about that.
 
     A damaged pair, or one that cannot be drawn any more, may be of the same world: answers of others stay.
     """
     held = run.pair(pair.name, pair.seed)
-    if _is_of_another_world(held, pair) or _is_dropped(run, pair) is False:
+    if _is_of_another_world(held, pair) or is_pair_dropped(run, pair) is False:
         for kind in ("cells", "answers"):
             remove(run.path / kind / held.parent.name / held.name)
+        remove(dropped_file(run, pair.name, pair.seed))  # last: it tells of which world they are
     remove(held)
     remove(run.maps(pair.name, pair.seed))
-
-
-def _is_dropped(run: RunFolder, pair: Pair) -> bool | None:
-    """Tell whether removed sessions were of this world; None where none were removed, or it cannot be told."""
-    if pair.scenario is None:
-        return None
-    return is_dropped(run, pair.name, pair.seed, pair.scenario.model_dump(mode="json"), pair.files)
 
 
 def _settle(run: RunFolder, pairs: Sequence[Pair], keep: Keep | None, progress: RunProgress, tools: Tools) -> None:

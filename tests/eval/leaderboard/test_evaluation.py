@@ -21,6 +21,8 @@ from eval.leaderboard.packing import pack_submission
 from eval.oracles.merge import OracleMerge, align_by_truth
 from eval.running.predictions import add_predictions
 from eval.running.rescoring import rescore
+from eval.running.scaling.keeping import drop_pair
+from eval.running.scaling.remaking import remake_pair
 from eval.running.stages.pair_stages import PairStages
 from eval.truth.adapters import pipeline_input
 from eval.truth.ground_truth import load_ground_truth
@@ -329,6 +331,22 @@ def test_rows_about_another_world_go_with_its_pair(evaluator: Evaluator) -> None
     assert rows_of(evaluator, "old")["scenario"].tolist() == ["smoke/unchanged"]
     assert not evaluator.run.answer(ONE_BOX, 20000, "old").exists()
     assert len(rows_of(evaluator)) == 2
+
+
+@pytest.mark.parametrize("remade", [False, True])
+def test_a_world_that_changed_after_its_sessions_were_removed_is_answered(evaluator: Evaluator, remade: bool) -> None:
+    evaluator.evaluate(name="old")
+    drop_pair(evaluator.run, ONE_BOX, 20000, "answers")
+    if remade:  # the record stays beside the sessions
+        remake_pair(evaluator.run, ONE_BOX, 20000, tools=TOOLS)
+    changed = load_scenario(ONE_BOX, 20000).model_copy(update={"description": "another world"})
+
+    def draw(name: str, seed: int, settings: tuple[str, ...] = ()) -> Scenario:
+        return changed if name == ONE_BOX else load_scenario(name, seed, settings)
+
+    assert evaluator.evaluate(tools=replace(TOOLS, draw=draw)).n_done == 2
+    assert read_pair_truth(evaluator.run.pair(ONE_BOX, 20000)).scenario == changed.model_dump(mode="json")
+    assert len(rows_of(evaluator)) == 2 and rows_of(evaluator, "old")["scenario"].tolist() == ["smoke/unchanged"]
 
 
 def test_answers_of_others_outlive_a_damaged_pair_and_a_world_that_cannot_be_drawn(evaluator: Evaluator) -> None:
