@@ -44,7 +44,7 @@ from eval.leaderboard.given_merge import MergeMode, write_merge
 from eval.plans.plan import Plan
 from eval.running.cell_file import LAST, NO_KEY, cell_document
 from eval.running.export import copy_pair
-from eval.running.pair_run import TOOLS, Pair, Tools, pair_lock, score_unmade
+from eval.running.pair_run import TOOLS, Pair, Tools, is_pair_dropped, pair_lock, score_unmade
 from eval.running.predictions import list_predicted, require_current_scores, require_free_name
 from eval.running.runfolder import RunFolder, write_json, write_tables
 from eval.running.runner import list_plan_pairs, open_pair, start_provenance
@@ -211,7 +211,13 @@ def _is_finished(run: RunFolder, method: Method, pair: Pair, called: str) -> boo
         return False
     if is_exchanged(call, run.answer(pair.name, pair.seed, method.name)):
         return False
-    return call.method_digest == called and call.pair_digest == digest_pair(run.pair(pair.name, pair.seed))
+    return call.method_digest == called and _is_about(run, pair, call)
+
+
+def _is_about(run: RunFolder, pair: Pair, call: CallFile) -> bool:
+    """Tell whether a call was about the present simulation of a pair; of removed sessions their record tells."""
+    is_kept = bool(call.pair_digest) and is_pair_dropped(run, pair) is True
+    return is_kept or call.pair_digest == digest_pair(run.pair(pair.name, pair.seed))
 
 
 def _evaluate_pair(run: RunFolder, method: Method, pair: Pair, called: str, progress: RunProgress, tools: Tools) -> str:

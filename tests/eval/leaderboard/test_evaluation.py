@@ -333,6 +333,13 @@ def test_rows_about_another_world_go_with_its_pair(evaluator: Evaluator) -> None
     assert len(rows_of(evaluator)) == 2
 
 
+def test_pairs_whose_sessions_were_removed_are_not_asked_again(evaluator: Evaluator) -> None:
+    evaluator.evaluate()
+    drop_pair(evaluator.run, ONE_BOX, 20000, "answers")
+    assert evaluator.evaluate().n_kept == 2
+    assert not evaluator.run.pair(ONE_BOX, 20000).exists()
+
+
 @pytest.mark.parametrize("remade", [False, True])
 def test_a_world_that_changed_after_its_sessions_were_removed_is_answered(evaluator: Evaluator, remade: bool) -> None:
     evaluator.evaluate(name="old")
