@@ -136,7 +136,7 @@ def run_plan(
     if mirror is not None:
         mirror.copy_cells(run)
         mirror.copy_tables(run)
-    _settle(run, pairs, keep, progress, tools)
+    _settle(run, pairs, keep, mirror, progress, tools)
     n_kept, n_died = len(own_cells) - n_todo, int((results["status"] == "worker_died").sum())
     return RunOutcome(n_run, n_kept, n_todo - n_run, n_died)
 
@@ -294,7 +294,9 @@ def _remove_pair(run: RunFolder, pair: Pair) -> None:
     remove(run.maps(pair.name, pair.seed))
 
 
-def _settle(run: RunFolder, pairs: Sequence[Pair], keep: Keep | None, progress: RunProgress, tools: Tools) -> None:
+def _settle(
+    run: RunFolder, pairs: Sequence[Pair], keep: Keep | None, mirror: Mirror | None, progress: RunProgress, tools: Tools
+) -> None:
     """Give the pairs that were finished before what `--keep` says: remove their sessions, or make those that lack."""
     for pair in pairs:
         if pair.todo or keep is None:
@@ -310,6 +312,8 @@ def _settle(run: RunFolder, pairs: Sequence[Pair], keep: Keep | None, progress: 
         elif keep == "nothing" or run.pair(pair.name, pair.seed).is_dir():
             with pair_lock(run, pair):
                 drop_pair(run, pair.name, pair.seed, keep)
+    if mirror is not None and keep is not None:
+        mirror.copy_cells(run)  # with the records of what was removed
 
 
 def _schedule_leanly(schedule: Callable[..., list[Pair]], run: RunFolder, keep: Keep | None) -> list[Pair]:

@@ -25,7 +25,7 @@ from scenarios.references import without_paths
 from sim.session.truth import read_pair_truth
 
 Keep = Literal["answers", "sessions", "nothing"]
-_FOLDER = "dropped"
+RECORDS = "dropped"
 # files that scoring and `tunnelcd describe` leave beside the sessions
 _DERIVED = {"scoring_points.npz", "descriptors"}
 _EXPECTED = "the pair cannot be made again: run its plan again with --force"
@@ -123,7 +123,7 @@ def _digest_without_paths(file: Path, named: Mapping[str, str]) -> str:
 
 def dropped_file(run: RunFolder, world: str, seed: int) -> Path:
     """Return where the record of a pair lies whose sessions were removed."""
-    return run.path / _FOLDER / run.pair(world, seed).parent.name / f"{seed}.json"
+    return run.path / RECORDS / run.pair(world, seed).parent.name / f"{seed}.json"
 
 
 def read_dropped(path: Path) -> Dropped | None:
@@ -151,10 +151,14 @@ def require_same_bytes(record: Dropped, pair: Path) -> None:
         )
 
 
+def list_records(run: RunFolder) -> list[Path]:
+    """Return the records of all pairs whose sessions were removed, also where these were made again."""
+    return sorted(run.path.glob(f"{RECORDS}/*/*.json"))
+
+
 def list_dropped(run: RunFolder) -> list[Path]:
     """Return the records of the pairs whose sessions are not in the folder."""
-    every = sorted(run.path.glob(f"{_FOLDER}/*/*.json"))
-    return [path for path in every if not (run.path / "pairs" / path.parent.name / path.stem).is_dir()]
+    return [path for path in list_records(run) if not (run.path / "pairs" / path.parent.name / path.stem).is_dir()]
 
 
 def is_dropped(

@@ -26,7 +26,7 @@ from eval.plans.cells import list_planned_cases
 from eval.plans.coverage import explain_unreadable_plan, read_stored_plan
 from eval.running.cell_rows import ITEM_TABLES, SURFACE_TABLES
 from eval.running.runfolder import RunFolder, open_run_folder, write_json, write_tables
-from eval.running.scaling.keeping import digest_files, read_dropped
+from eval.running.scaling.keeping import digest_files, list_records, read_dropped
 from eval.running.scaling.merged_provenance import unite_provenance
 from eval.running.scaling.shards import number_pairs, stored_shard
 
@@ -238,7 +238,7 @@ def _require_same_pairs(runs: Sequence[RunFolder], progress: RunProgress) -> Non
     """Refuse a pair of which two runs answered different sessions; of removed ones the record tells."""
     holders: dict[str, dict[Path, Path]] = {}
     for run in runs:
-        records = {path.with_suffix(""): path for path in sorted(run.path.glob("dropped/*/*.json"))}
+        records = {path.with_suffix(""): path for path in list_records(run)}
         pairs = {path.parents[1]: path.parents[1] for path in sorted(run.path.glob("pairs/*/*/truth/changes.json"))}
         for path, place in (records | pairs).items():
             holders.setdefault("/".join(path.parts[-2:]), {})[run.path] = place
@@ -268,7 +268,7 @@ def _digest_pair(place: Path) -> str | None:
 def _take_records(runs: Sequence[RunFolder], target: Path) -> None:
     """Copy the records of removed sessions."""
     for run in runs:
-        for path in sorted(run.path.glob("dropped/*/*.json")):
+        for path in list_records(run):
             name = path.relative_to(run.path)
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target / name)

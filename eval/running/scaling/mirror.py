@@ -2,7 +2,8 @@
 
 A run works in its own folder, on a disk of its machine. After each pair it copies the answers of the pair and then its
 cells, and the tables at the end. A run that begins takes the finished cells from there, so it goes on where an earlier
-one on another machine ended. Sessions, maps and stages are not copied: they can be made again.
+one on another machine ended. Sessions, maps and stages are not copied: they can be made again. The records of removed
+sessions (`eval.running.scaling.keeping`) are, as they tell how.
 """
 
 from __future__ import annotations
@@ -22,13 +23,15 @@ from eval.core.provenance import TOOL
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.running.pair_run import Pair
 from eval.running.runfolder import RunFolder, read_json, write_json
+from eval.running.scaling.keeping import RECORDS, dropped_file, list_records
 
 _ANSWER = ("answer.npz", "answer.json")
 _PART = r"(?!\.)[A-Za-z0-9._=,-]{1,210}"
 _CELL = re.compile(rf"cells/{_PART}/\d{{1,15}}/{_PART}\.json", re.ASCII)
+_DROPPED = re.compile(rf"{RECORDS}/{_PART}/\d{{1,15}}\.json", re.ASCII)
 _STORED_ANSWER = re.compile(rf"answers/{_PART}/\d{{1,15}}/{_PART}/answer\.(json|npz)", re.ASCII)
 _MAX_ANSWER_BYTES = 1 << 30
-_RECORD = "copied.json"  # in the run folder: when the newest cell was written that is at a URL
+_RECORD = "copied.json"  # in the run folder: when the newest cell or record was written that is at a URL
 
 
 class Mirror:
@@ -46,7 +49,7 @@ class Mirror:
             raise InputError("a URL with a password would stand in provenance.json: leave it to fsspec's configuration")
         self.url = url
         self._fs, self._root = _open(url)
-        self._fetched: dict[str, int] = {}  # cells that were taken from there, and when they were written here
+        self._fetched: dict[str, int] = {}  # what was taken from there, and when it was written here
 
     def provenance(self) -> dict[str, Any]:
         """Return the provenance of the run there; {} where there is none.
@@ -69,17 +72,19 @@ class Mirror:
         return dict(document)
 
     def fetch(self, run: RunFolder, progress: RunProgress | None = None) -> None:
-        """Take the finished cells that the folder lacks.
+        """Take the finished cells, and the records of removed sessions, that the folder lacks.
 
         Raises:
             InputError: They cannot be read.
         """
-        names = [name for name in self._list("cells") if _CELL.fullmatch(name) and not (run.path / name).exists()]
+        stored = [name for name in self._list("cells") if _CELL.fullmatch(name)]
+        stored += [name for name in self._list(RECORDS) if _DROPPED.fullmatch(name)]
+        names = [name for name in stored if not (run.path / name).exists()]
         self._get(run.path, names, progress or Silent())
         self._fetched |= {name: (run.path / name).stat().st_mtime_ns for name in names}
 
     def fetch_all(self, folder: Path, progress: RunProgress | None = None) -> None:
-        """Take provenance, cells and answers into an empty folder.
+        """Take provenance, cells, answers and records of removed sessions into an empty folder.
 
         Raises:
             InputError: There is no run there, or it cannot be read.
@@ -88,35 +93,42 @@ class Mirror:
             raise InputError(f"{self.url}: no copy of a run is there (no provenance.json)")
         names = [name for name in self._list("cells") if _CELL.fullmatch(name)]
         names += [name for name in self._list("answers") if _STORED_ANSWER.fullmatch(name)]
+        names += [name for name in self._list(RECORDS) if _DROPPED.fullmatch(name)]
         self._get(folder, [*names, "provenance.json"], progress or Silent())
 
     def forget(self, run: RunFolder, pairs: Iterable[Pair]) -> None:
-        """Remove cells of pairs that run which the folder lacks, so that no later run takes the old ones.
+        """Remove cells and records of pairs that run which the folder lacks, so that no later run takes the old ones.
 
         They were taken before (`fetch`): what is gone since is about to run again, or is about another world.
 
         Raises:
             InputError: They cannot be removed.
         """
-        running = {_relative(run, run.cell(pair.name, pair.seed, "any").parent) for pair in pairs if pair.todo}
+        running = [pair for pair in pairs if pair.todo]
+        places = {_relative(run, run.cell(pair.name, pair.seed, "any").parent) for pair in running}
+        records = {_relative(run, dropped_file(run, pair.name, pair.seed)) for pair in running}
         with self._told():
-            for name in self._list("cells"):
-                if name.rpartition("/")[0] in running and not (run.path / name).exists():
+            for name in [*self._list("cells"), *self._list(RECORDS)]:
+                if (name.rpartition("/")[0] in places or name in records) and not (run.path / name).exists():
                     self._fs.rm_file(self._place(name))
 
     def copy_pair(self, run: RunFolder, pair: Pair) -> None:
         """Copy the answers of the cells of a pair that ran, and then the cells, whose files say that they are finished.
 
+        A record of its sessions, if they were removed, comes first: cells of a later run are of the same ones.
+
         Raises:
             InputError: The place cannot be written.
         """
+        record = dropped_file(run, pair.name, pair.seed)
+        self._put(run, [record] if record.is_file() else [])
         cells = [run.cell(pair.name, pair.seed, each.cell.variant) for each in pair.todo]
         for cell in cells:
             self._copy_cell(run, cell)
-        self._note_copied(run, cells)
+        self._note_copied(run, [record, *cells])
 
     def copy_cells(self, run: RunFolder) -> None:
-        """Copy provenance, and the finished cells that are not there or were written here since the last copy.
+        """Copy provenance, and the records and cells that are not there or were written here since the last copy.
 
         The first are of an interrupted pair, or of a run that began without a copy; the others of a command that was
         not told of it. With its provenance a copy that an interrupt cuts short is one of a run.
@@ -125,18 +137,22 @@ class Mirror:
             InputError: The place cannot be written.
         """
         self._put(run, [run.path / "provenance.json"])
-        stored, copied_ns = set(self._list("cells")), self._copied_ns(run)
-        cells = sorted(run.path.glob("cells/*/*/*.json"))
-        for cell in cells:
-            name, written_ns = _relative(run, cell), cell.stat().st_mtime_ns
-            if name not in stored or (written_ns > copied_ns and self._fetched.get(name) != written_ns):
-                self._copy_cell(run, cell)
-        if cells:
-            self._note_copied(run, cells)
+        stored, copied_ns = {*self._list("cells"), *self._list(RECORDS)}, self._copied_ns(run)
 
-    def _note_copied(self, run: RunFolder, cells: Iterable[Path]) -> None:
-        """Note when the newest cell was written that is there; one that is newer is copied again."""
-        times_ns = [cell.stat().st_mtime_ns for cell in cells if cell.exists()]
+        def is_due(file: Path) -> bool:
+            name, written_ns = _relative(run, file), file.stat().st_mtime_ns
+            return name not in stored or (written_ns > copied_ns and self._fetched.get(name) != written_ns)
+
+        records, cells = list_records(run), sorted(run.path.glob("cells/*/*/*.json"))
+        self._put(run, [*filter(is_due, records)])
+        for cell in filter(is_due, cells):
+            self._copy_cell(run, cell)
+        if cells:
+            self._note_copied(run, [*records, *cells])
+
+    def _note_copied(self, run: RunFolder, files: Iterable[Path]) -> None:
+        """Note when the newest of these files was written that is there; one that is newer is copied again."""
+        times_ns = [file.stat().st_mtime_ns for file in files if file.exists()]
         noted = {**read_json(run.path / _RECORD), self._key: max([self._copied_ns(run), *times_ns])}
         write_json(run.path / _RECORD, noted)
 

@@ -13,6 +13,7 @@ from cdpipe.core.errors import InputError
 from eval.plans.plan import Plan
 from eval.running.pair_run import Pair
 from eval.running.runfolder import RunFolder, write_json
+from eval.running.scaling.keeping import list_records
 from eval.running.scaling.mirror import Mirror
 from eval.running.scaling.shards import Shard
 from scenarios.schema import Scenario
@@ -46,6 +47,37 @@ def test_rows_and_answers_are_copied_and_a_new_folder_goes_on(
         shutil.copyfile(run.path / f"{table}.csv", tmp_path / "c" / f"{table}.csv")
     assert list(differences(tmp_path / "c", shards[0])) == []
     assert Mirror(url).provenance() == run.provenance()
+
+
+def test_records_of_removed_sessions_are_copied_and_taken(tmp_path: Path, runner: Runner, plan: Plan, url: str) -> None:
+    run, _ = runner.run(tmp_path / "a", plan, shard=PART, mirror=Mirror(url), keep="answers")
+    records = {path.relative_to(run.path): path.read_bytes() for path in list_records(run)}
+    Mirror(url).fetch_all(tmp_path / "c")
+    more = plan.model_copy(
+        update={"variants": (*plan.variants, plan.variants[0].model_copy(update={"preset": "paper"}))}
+    )
+    b, _ = runner.run(tmp_path / "b", plan, shard=PART, mirror=Mirror(url), keep="answers")
+    for folder in (tmp_path / "c", b.path):
+        assert {path.relative_to(folder): path.read_bytes() for path in list_records(RunFolder(folder))} == records
+    assert len(records) == 2
+
+    def other(*told: object) -> None:
+        runner.copy(*told)  # type: ignore[arg-type]
+        (Path(str(told[2])) / "after" / "more").write_text("")
+
+    # a machine that makes other bytes does not mix them with those of before
+    with pytest.raises(InputError, match="made again, and its files differ"):
+        runner.run(b.path, more, shard=PART, mirror=Mirror(url), tools=replace(runner.tools, simulate=other))
+    tools = replace(runner.tools, draw=load_other)
+    runner.run(b.path, plan, shard=PART, mirror=Mirror(url), tools=tools)
+    assert Mirror(url)._list("dropped") == []  # those were of the old world
+
+
+def test_sessions_that_are_removed_later_leave_their_records_there(tmp_path: Path, runner: Runner, plan: Plan) -> None:
+    url = f"file://{tmp_path}/far"
+    runner.run(tmp_path / "a", plan, shard=PART, mirror=Mirror(url))
+    runner.run(tmp_path / "a", plan, shard=PART, mirror=Mirror(url), keep="answers")
+    assert len(list((tmp_path / "far").glob("dropped/*/*.json"))) == 2
 
 
 def test_forced_cells_are_forgotten_there_first(tmp_path: Path, runner: Runner, plan: Plan) -> None:
