@@ -47,7 +47,7 @@ def unite_provenance(
         "started": min(str(each.get("started")) for each in told),
         "command": command,
         "git_commit": told[0].get("git_commit") if len(commits) == 1 else None,
-        "machine": _unite_machines([each.get("machine") for each in told]),
+        "machine": _unite_machines([part.get("machine") for part in parts]),
         "parts": parts,
     }
     return united, notes
@@ -67,8 +67,8 @@ def resume_provenance(name: str, earlier: Mapping[str, Any], now: Mapping[str, A
         raise InputError(f"{name}: {error}; or name a new folder, or add --force, which makes all anew") from error
     if "parts" not in earlier and earlier.get("machine") == now.get("machine"):
         return dict(now)
-    machine = _unite_machines([earlier.get("machine"), now.get("machine")])
-    return {**now, "machine": machine, "parts": [*_parts(name, earlier), *_parts(name, now)]}
+    parts = [*_parts(name, earlier), *_parts(name, now)]
+    return {**now, "machine": _unite_machines([part.get("machine") for part in parts]), "parts": parts}
 
 
 def _require_alike(
@@ -119,7 +119,7 @@ def _name_difference(one: Any, two: Any) -> str:
 
 def _parts(name: str, provenance: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return what is told of a run in the union; a union tells of its own parts."""
-    if isinstance(parts := provenance.get("parts"), list):
+    if isinstance(parts := provenance.get("parts"), list) and parts:
         return [dict(part) for part in parts if isinstance(part, Mapping)]
     keys = ("shard", "started", "finished", "command", "git_commit", "machine")
     return [{"folder": name, **{key: provenance.get(key) for key in keys}}]

@@ -53,6 +53,16 @@ def test_each_run_is_compared_with_each_other() -> None:
     assert unite_provenance(["a", "b"], told[:2], "merge-runs")[0]["parts"]
 
 
+def test_each_machine_is_named_once_however_often_a_run_goes_on() -> None:
+    one, other = ({**NOW, "machine": {**NOW["machine"], "cpu": cpu, "cores": n}} for cpu, n in (("a", 2), ("b", 4)))
+    found = resume_provenance("run", one, other)
+    for now in (one, other, other):
+        found = resume_provenance("run", found, now)
+        assert (found["machine"]["cpu"], found["machine"]["cores"]) == ("a and b", "2 and 4")
+    united, _ = unite_provenance(["x", "y"], [{**each, "started": "1"} for each in (found, other)], "merge-runs")
+    assert united["machine"] == found["machine"]
+
+
 def test_packages_of_today_did_not_make_the_cells_of_an_earlier_run() -> None:
     older = {name: value for name, value in NOW.items() if name != "extras"}
     assert "extras" not in keep_makers(NOW, older)
