@@ -35,9 +35,10 @@ class _Funnel(TyperGroup):
             with input_errors(), interrupts_kept():
                 return super().invoke(ctx)
         except KeyboardInterrupt as error:
-            kept = None if "--unpack" in sys.argv else _KEPT.get(ctx.invoked_subcommand or "")
-            kept = "pairs" if kept is not None and "--release" in sys.argv else kept
-            again = "the same command without --force" if "--force" in sys.argv else "the same command"
+            options = {word.partition("=")[0] for word in sys.argv}  # --unpack=FILE is --unpack FILE
+            kept = None if "--unpack" in options else _KEPT.get(ctx.invoked_subcommand or "")
+            kept = "pairs" if kept is not None and "--release" in options else kept
+            again = "the same command without --force" if "--force" in options else "the same command"
             going_on = f"finished {kept} are kept, {again} goes on from there"
             told = going_on if kept else "nothing half-written is left"
             sys.stderr.write(f"interrupted; {told}\n")

@@ -83,7 +83,7 @@ def digest_programs(words: Sequence[str]) -> dict[str, str]:
         InputError: A file cannot be read.
     """
     named = [word for word in words[:1] if os.sep in word] + [word for word in words[1:] if "{" not in word]
-    return {word: _digest_file(Path(word)) for word in named if Path(word).is_file()}
+    return {word: _digest_file(Path(word)) for word in named if _is_there(word) and Path(word).is_file()}
 
 
 def run_command(words: Sequence[str], places: Mapping[str, Path], folder: Path, limit_s: float) -> Ended:
@@ -148,9 +148,10 @@ def _check_script(words: Sequence[str]) -> None:
     """Refuse a script that does not exist: the command would fail on every pair, after all are simulated."""
     word = next((word for word in words if not word.startswith("-") or word in _TAKES_CODE), "")
     script = Path(word)
-    if script.suffix not in _SCRIPT_SUFFIXES or "{" in word or script.exists():
+    if script.suffix not in _SCRIPT_SUFFIXES or "{" in word or _is_there(word):
         return
-    beside = (str(script.with_name(each.name)) for each in script.parent.glob(f"*{script.suffix}"))
+    others = script.parent.glob(f"*{script.suffix}") if _is_there(str(script.parent)) else ()
+    beside = (str(script.with_name(each.name)) for each in others)
     raise InputError(
         f"--command: {visible(word)}: no such file in {visible(str(Path.cwd()))}{suggest(word, list(beside))}: "
         "name the script by its path from there, or by its whole path"
@@ -170,7 +171,15 @@ def _digest_file(path: Path) -> str:
 
 def _make_absolute(word: str) -> str:
     is_path = (os.sep in word or "." in word) and "{" not in word
-    return str(Path(word).absolute()) if is_path and Path(word).exists() else word
+    return str(Path(word).absolute()) if is_path and _is_there(word) else word
+
+
+def _is_there(word: str) -> bool:
+    """Tell whether a word names a file or folder; one that no file can have as its name does not."""
+    try:
+        return Path(word).exists()
+    except OSError:
+        return False
 
 
 def _keep_tail(stream: BinaryIO, tail: bytearray) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
@@ -87,7 +88,13 @@ def foreign_identity(run: RunFolder, slug: str, seed: str, name: str) -> dict[st
     """Return the identity of an answer of another program, for `cell_document`.
 
     The world gets the name that the run's own cells give it, or that of its folder where there are none.
+
+    Raises:
+        InputError: The name of the pair's folder is no seed.
     """
+    if not re.fullmatch(r"\d{1,15}", seed, re.ASCII):
+        told = visible(f"{slug}/{seed}")
+        raise InputError(f"{run.path}: holds {told}, whose name is no seed: move it out of the run")
     row = run.any_row(slug) or {"scenario": slug.replace("__", "/")}
     world = {"scenario": row["scenario"], "pair_kind": row.get("pair_kind", "")}
     who = {"seed": int(seed), "variant": name, "preset": name, "commit": None, "is_contended": False}

@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import TypeAdapter, ValidationError
+
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_json, read_npz
 from eval.core.output import copy_folder, new_folder
@@ -33,6 +35,8 @@ from eval.running.scaling.shards import number_pairs, stored_shard
 _ANSWER = ("answer.json", "answer.npz")
 # what two answers of one method share (`eval.leaderboard.calls.digest_method`), and the plan that they are of
 _OF_A_METHOD = ("command", "programs", "merge", "limit_s", "plan", "plan_digest", "split")
+
+_PAIRS: TypeAdapter[list[tuple[str, int]]] = TypeAdapter(list[tuple[str, int]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,9 +293,17 @@ def _unite_evaluations(runs: Sequence[RunFolder]) -> dict[str, dict[str, Any]]:
                     f"({differing[0]}): evaluate one of them under another name"
                 )
             holders.setdefault(name, run.path)
-            pairs = [tuple(pair) for pair in (*other.get("pairs", ()), *found.get("pairs", ()))]
-            united[name] = {**other, "pairs": list(dict.fromkeys(pairs))}
+            pairs = dict.fromkeys([*_read_pairs(other, path), *_read_pairs(found, path)])
+            united[name] = {**other, "pairs": list(pairs)}
     return united
+
+
+def _read_pairs(evaluation: Mapping[str, Any], path: Path) -> list[tuple[str, int]]:
+    """Return scenario and seed of each pair of an evaluation.json."""
+    try:
+        return _PAIRS.validate_python(evaluation.get("pairs", ()))
+    except ValidationError as error:
+        raise InputError(f"{path}: damaged: expected pairs of a scenario and a seed: evaluate again there") from error
 
 
 def _take_evaluations(

@@ -45,7 +45,7 @@ class Mirror:
     """
 
     def __init__(self, url: str) -> None:
-        if urlsplit(url).password is not None:
+        if _password_of(url) is not None:
             raise InputError("a URL with a password would stand in provenance.json: leave it to fsspec's configuration")
         self.url = url
         self._fs, self._root = _open(url)
@@ -226,6 +226,13 @@ class Mirror:
 def is_url(text: str) -> bool:
     """Tell whether a run is named by a URL and not by its folder."""
     return "://" in text
+
+
+def _password_of(url: str) -> str | None:
+    try:
+        return urlsplit(url).password
+    except ValueError as error:
+        raise InputError(f"{url}: no URL: {error}") from error
 
 
 def _open(url: str) -> tuple[Any, str]:

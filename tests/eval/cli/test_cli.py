@@ -19,6 +19,7 @@ from cdpipe.io.readers import open_session
 from cdpipe.model.config import DescriptorConfig
 from cdpipe.model.types import DescriptorSet, ScanSource
 from cdpipe.pipeline import mapping
+from eval.cli.commands import training
 from eval.cli.inputs import with_surface
 from eval.cli.main import main
 from eval.graft import making
@@ -485,6 +486,23 @@ def test_an_interrupt_says_that_cells_are_kept(
     for arguments in (("run", "smoke"), ("demo",)):
         code, _, err = command(*arguments, "--out", tmp_path / "out", "--quiet")
         assert (code, "finished cells are kept" in err) == (130, True)
+
+
+@pytest.mark.parametrize("sign", [" ", "="])
+@pytest.mark.parametrize(
+    ("option", "said"), [("--release", "finished pairs are kept"), ("--unpack", "nothing half-written is left")]
+)
+def test_an_interrupt_of_a_release_is_told_however_its_option_is_written(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch, option: str, said: str, sign: str
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(training, "_release_or_unpack", interrupted)
+    words = ["dataset", *f"{option}{sign}x".split(), "--out", str(tmp_path / "x")]
+    monkeypatch.setattr(sys, "argv", ["tunnelcd", *words])
+    code, _, err = command(*words)
+    assert (code, said in err) == (130, True)
 
 
 def test_an_interrupt_elsewhere_leaves_nothing_half_written(

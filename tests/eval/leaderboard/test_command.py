@@ -55,6 +55,15 @@ def test_words_that_name_files_become_absolute(tmp_path: Path, monkeypatch: pyte
     assert list(digest_programs(words)) == [sys.executable, str(tmp_path / "x.py")]
 
 
+def test_a_word_that_is_too_long_for_a_name_of_a_file_is_none() -> None:
+    for long in (f"{'x' * 300}.y", f"{'x/' * 3000}y"):
+        words = parse_command(f"{sys.executable} -c pass {long} {WHOLE}", gets_merge=False)
+        assert words[3] == long and list(digest_programs(words)) == [sys.executable]
+    for long in (f"{'x' * 300}.py", f"{'x' * 300}/y.py"):
+        with pytest.raises(InputError, match="no such file"):
+            parse_command(f"{sys.executable} {long} {WHOLE}", gets_merge=False)
+
+
 def test_a_program_that_is_named_by_its_file_is_noticed_when_it_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -173,6 +173,10 @@ def test_a_folder_that_holds_something_else_is_refused(run: RunFolder, tmp_path:
     code, _, err = command("export", run.path, "--out", tmp_path / "file")
     assert code == 2 and "cannot write there" in err
     assert command("export", tmp_path / "none", "--out", tmp_path / "blind")[0] == 2
+    pair = next(run.path.glob("pairs/*/*"))
+    shutil.copytree(pair, pair.with_suffix(".bak"))
+    code, _, err = command("export", run.path, "--out", tmp_path / "backup")
+    assert code == 2 and f"holds {pair.parent.name}/{pair.name}.bak, whose name is no seed" in err
     shutil.rmtree(run.path / "pairs")
     code, _, err = command("export", run.path, "--out", tmp_path / "blind")
     assert code == 2 and "holds no simulated pairs" in err and not (tmp_path / "blind").exists()

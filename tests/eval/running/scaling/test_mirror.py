@@ -250,6 +250,7 @@ def test_a_cell_that_is_too_large_is_not_taken(tmp_path: Path, monkeypatch: pyte
     ("url", "what"),
     [
         ("nosuch://x/y", "nosuch://x/y"),
+        ("s3://[b/x", "s3://[b/x: no URL: "),
         ("ftp://me:secret@host/run", "a URL with a password would stand in provenance.json"),
     ],
 )

@@ -249,6 +249,12 @@ def test_what_was_evaluated_comes_along_and_two_methods_of_one_name_do_not(
     other.write_text(json.dumps({**json.loads(other.read_text()), "merge": "given"}))
     with pytest.raises(InputError, match=r"under the name mine \(merge\): evaluate one of them"):
         merge_runs(copies, tmp_path / "two", keep="answers")
+    for pairs in (None, 3, [1], [["world"]], [["world", "x"]]):
+        for copy in copies:
+            path = copy / "evaluations" / "mine" / "evaluation.json"
+            path.write_text(json.dumps({**json.loads(path.read_text()), "merge": "own", "pairs": pairs}))
+        with pytest.raises(InputError, match=r"evaluation\.json: damaged: expected pairs"):
+            merge_runs(copies, tmp_path / "two", keep="answers")
 
 
 def test_the_record_of_a_call_is_of_the_run_that_gives_its_answer(tmp_path: Path, shards: Sequence[Path]) -> None:
