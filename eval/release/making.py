@@ -15,6 +15,7 @@ import re
 import shutil
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,7 +25,7 @@ from pydantic import TypeAdapter
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.whole_file import partial_of, whole_file
 from eval.core.cluster import HERE, Where, connected, require_usable
-from eval.core.output import made_parents, make_writable, remove, require_no_links
+from eval.core.output import made_parents, make_writable, only_writer, remove, require_no_links
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.release.archive import SESSIONS, SUMS, TRUTH, list_files, pack, read_sums, write_sums
 from eval.release.card import write_release_card
@@ -78,7 +79,7 @@ def make_release(
         progress: Receives the number of finished pairs.
 
     Raises:
-        InputError: `out` cannot be used, or a scheduler of other machines is named.
+        InputError: `out` cannot be used, another process makes it, or a scheduler of other machines is named.
         ScenarioError: A pair cannot be built.
     """
     progress, start = progress or Silent(), time.perf_counter()
@@ -91,7 +92,7 @@ def make_release(
     folder = out.with_name(f"{out.name}.parts") if is_file else out
     if is_file and folder.is_symlink():
         raise InputError(f"{folder}: is a link, and this folder is removed in the end: remove the link")
-    with made_parents(out), removed_if_empty(folder):
+    with made_parents(out), removed_if_empty(folder), _held(folder):
         _take_folder(folder, release)
         missing = [pair for pair in release.pairs if not _is_finished(folder, pair)]
         todo = missing[:limit]
@@ -101,6 +102,14 @@ def make_release(
             return ReleaseOutcome(*counts, 0, time.perf_counter() - start)
         n_bytes = _finish(release, folder, out if is_file else None, progress)
         return ReleaseOutcome(*counts, n_bytes, time.perf_counter() - start)
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """Make a folder unless it exists, and hold it against other processes that make a release there."""
+    make_writable(folder)
+    with only_writer(folder, "tunnelcd dataset --release"):
+        yield
 
 
 def make_pair(folder: Path, name: str, seed: int, scenario: Scenario) -> None:
@@ -145,8 +154,7 @@ def _keep_truth(whole: Path, sessions: Path) -> None:
 
 
 def _take_folder(folder: Path, release: Release) -> None:
-    """Make the folder, or check that it is of this release, and remove what a killed run left."""
-    make_writable(folder)
+    """Check that a folder is of this release, and remove what a killed run left."""
     require_no_links(folder)
     for left in folder.glob(f"{_SCRATCH}*"):
         if _LEFT.fullmatch(left.name):

@@ -14,6 +14,7 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from eval.core.cluster import Where
+from eval.core.output import only_writer
 from eval.plans.splits import load_splits
 from eval.release import making
 from eval.release.archive import list_files, pack, read_sums, unpack_release, write_sums
@@ -184,6 +185,17 @@ def test_a_pair_that_was_interrupted_is_made_again(
     assert make_release(release, tmp_path / "raw").n_made == 1
     pack(tmp_path / "raw", tmp_path / "again.zip")
     assert (tmp_path / "again.zip").read_bytes() == made.read_bytes()
+
+
+def test_a_second_release_in_one_place_is_refused(tiny: Path, tmp_path: Path) -> None:
+    left = tmp_path / "own.zip.parts" / ".making-0a1b2c_d"  # what the first works in
+    left.mkdir(parents=True)
+    with (
+        only_writer(left.parent, "tunnelcd dataset --release"),
+        pytest.raises(InputError, match="another `tunnelcd dataset --release` writes there"),
+    ):
+        make_release(load_release(str(tiny)), tmp_path / "own.zip")
+    assert left.is_dir()
 
 
 @pytest.mark.parametrize(
