@@ -66,9 +66,13 @@ def read_sums(folder: Path) -> dict[str, str]:
 
 
 def pack(folder: Path, file: Path, progress: RunProgress | None = None) -> None:
-    """Write a zip archive of a folder: the same files give the same bytes with the same zlib."""
+    """Write a zip archive of a folder: the same files give the same bytes with the same zlib.
+
+    Raises:
+        InputError: It grows larger than what `unpack_release` takes.
+    """
     names = list_files(folder)
-    with zipfile.ZipFile(file, "w") as archive:
+    with file.open("wb") as stream, zipfile.ZipFile(stream, "w") as archive:
         for done, name in enumerate(names):
             (progress or Silent()).stage("archive", done, len(names))
             member = zipfile.ZipInfo(name)  # the start of 1980
@@ -76,6 +80,16 @@ def pack(folder: Path, file: Path, progress: RunProgress | None = None) -> None:
             member.file_size = (folder / name).stat().st_size
             with (folder / name).open("rb") as source, archive.open(member, "w") as target:
                 shutil.copyfileobj(source, target, 1 << 20)
+            _require_unpackable(stream.tell(), folder)
+    _require_unpackable(file.stat().st_size, folder)
+
+
+def _require_unpackable(n_bytes: int, folder: Path) -> None:
+    if n_bytes > _MOST_BYTES:
+        raise InputError(
+            f"{folder}: its archive is larger than the {_MOST_BYTES >> 20} MB that can be unpacked again: the pairs "
+            "stay here; make releases of fewer pairs, or name this folder with --out"
+        )
 
 
 def unpack_release(file: Path, out: Path, *, with_truth: bool = False, progress: RunProgress | None = None) -> int:

@@ -187,6 +187,23 @@ def test_a_pair_that_was_interrupted_is_made_again(
     assert (tmp_path / "again.zip").read_bytes() == made.read_bytes()
 
 
+def test_a_release_that_could_not_be_unpacked_is_not_packed_and_keeps_its_pairs(
+    made: Path, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = tmp_path / "own.zip.parts"
+    with zipfile.ZipFile(made) as archive:
+        archive.extractall(parts)
+    files, n_bytes = list_files(parts), made.stat().st_size
+    for most_bytes in (n_bytes // 2, n_bytes - 1):
+        monkeypatch.setattr("eval.release.archive._MOST_BYTES", most_bytes)
+        with pytest.raises(InputError, match="its archive is larger than"):
+            make_release(load_release(str(tiny)), tmp_path / "own.zip")
+        assert [path.name for path in tmp_path.iterdir()] == [parts.name] and list_files(parts) == files
+    monkeypatch.setattr("eval.release.archive._MOST_BYTES", n_bytes)
+    assert make_release(load_release(str(tiny)), tmp_path / "own.zip").n_bytes == n_bytes
+    assert unpack_release(tmp_path / "own.zip", tmp_path / "pairs") == 2
+
+
 def test_a_second_release_in_one_place_is_refused(tiny: Path, tmp_path: Path) -> None:
     left = tmp_path / "own.zip.parts" / ".making-0a1b2c_d"  # what the first works in
     left.mkdir(parents=True)
