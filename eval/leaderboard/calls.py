@@ -1,6 +1,7 @@
 """What is kept of the calls of an evaluated command, beside its rows.
 
-    RUN/evaluations/<method>/evaluation.json        command, merge, time limit, plan; digests of the programs' files
+    RUN/evaluations/<method>/evaluation.json        command, merge, time limit, plan; digests of the programs' files;
+                                                    code, machine and packages that asked
     RUN/evaluations/<method>/<world>/<seed>.json    how the call ended: seconds, error, end of its standard error;
                                                     digests of the pair, of what was called and of what it answered
 
@@ -29,8 +30,20 @@ _EXPECTED = "--force answers all pairs again"
 ANSWER_FILES = ("answer.json", "answer.npz")
 
 
+class Asker(Settings):
+    """What asked pairs: the code (None where it is not known), the machine, and the versions of packages."""
+
+    commit: str | None
+    machine: Mapping[str, Any]
+    versions: Mapping[str, str]
+
+
 class EvaluationFile(Settings):
-    """RUN/evaluations/<method>/evaluation.json; `pairs` are (scenario, seed) of the plan that was evaluated last."""
+    """RUN/evaluations/<method>/evaluation.json.
+
+    `pairs` are (scenario, seed) of the plan that was evaluated last. `askers` are all that asked pairs whose calls are
+    kept, each once; () where an older tunnelcd did.
+    """
 
     format: Literal["tunnelcd-evaluation"] = "tunnelcd-evaluation"
     format_version: Literal[1] = 1
@@ -43,6 +56,7 @@ class EvaluationFile(Settings):
     plan_digest: str
     split: str = ""
     pairs: tuple[tuple[str, int], ...]
+    askers: tuple[Asker, ...] = ()
 
 
 class CallFile(Settings):
@@ -65,13 +79,18 @@ def evaluation_folder(run: RunFolder, name: str) -> Path:
     return run.path / "evaluations" / path_part(name)
 
 
+def evaluation_path(run: RunFolder, name: str) -> Path:
+    """Return the file that says how a method was evaluated."""
+    return evaluation_folder(run, name) / "evaluation.json"
+
+
 def read_evaluation(run: RunFolder, name: str) -> EvaluationFile:
     """Read how a method was evaluated.
 
     Raises:
         InputError: It was not, or the file is damaged.
     """
-    path = evaluation_folder(run, name) / "evaluation.json"
+    path = evaluation_path(run, name)
     return validate(EvaluationFile, Document(str(path), read_json(path, _EXPECTED)))
 
 

@@ -23,10 +23,11 @@ from cdpipe.core.errors import InputError, MergeFailedError, TunnelcdError
 from cdpipe.core.names import path_part
 from cdpipe.io.answer import write_failure
 from eval.core.output import remove
-from eval.core.provenance import digest
+from eval.core.provenance import digest, machine, versions
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.leaderboard.calls import (
     ANSWER_FILES,
+    Asker,
     CallFile,
     EvaluationFile,
     call_path,
@@ -34,6 +35,7 @@ from eval.leaderboard.calls import (
     digest_method,
     digest_pair,
     evaluation_folder,
+    evaluation_path,
     is_exchanged,
     read_call,
     read_call_file,
@@ -114,8 +116,11 @@ def evaluate_command(
     require_current_scores(run)
     pairs = list_plan_pairs(plan, run, tools)
     start_provenance(plan, run, command, tools)
-    called = digest_method(_take_over(run, method, plan, pairs, force=force))
+    document = _take_over(run, method, plan, pairs, force=force)
+    called = digest_method(document)
     todo = [pair for pair in pairs if force or not _is_finished(run, method, pair, called)]
+    if todo:
+        _note_asker(run, document, tools)
     # the order of a plan would tell which world a pair is of; a seed would, too
     random.SystemRandom().shuffle(todo)
     for done, pair in enumerate(todo):
@@ -140,14 +145,14 @@ def _take_over(run: RunFolder, method: Method, plan: Plan, pairs: Sequence[Pair]
         programs=digest_programs(method.command), plan=plan.name, plan_digest=digest(plan.model_dump(mode="json")),
         split=plan.split, pairs=tuple((pair.name, pair.seed) for pair in pairs),
     )  # fmt: skip
-    path = evaluation_folder(run, method.name) / "evaluation.json"
-    if not path.exists() and not force and (others := list_predicted(run, method.name)):
+    path = evaluation_path(run, method.name)
+    earlier = _read_earlier(run, method.name, force=force) if path.exists() else None
+    if earlier is None and not force and (others := list_predicted(run, method.name)):
         raise InputError(
             f"--as {method.name}: {len(others)} answers of this name came from elsewhere: give another name, or "
             "--force, which removes them"
         )
-    if path.exists() and not force:
-        earlier = read_evaluation(run, method.name)
+    if earlier is not None and not force:
         for name, told in (("command", "--command"), ("merge", "--merge"), ("limit_s", "--time-limit")):
             if (was := getattr(earlier, name)) != getattr(document, name):
                 shown = " ".join(was) if isinstance(was, tuple) else was
@@ -164,8 +169,31 @@ def _take_over(run: RunFolder, method: Method, plan: Plan, pairs: Sequence[Pair]
         is_changed = _remove_stale(run, method.name, digest_method(document), pairs)
         if is_changed:  # no table holds the rows of another call while this one answers
             _renew_tables(run)
+    if earlier is not None and any(path.parent.glob("*/*.json")):  # of calls that are kept
+        document = document.model_copy(update={"askers": earlier.askers})
     write_json(path, document.model_dump(mode="json"))
     return document
+
+
+def _read_earlier(run: RunFolder, name: str, *, force: bool) -> EvaluationFile | None:
+    """Read evaluation.json; a damaged one counts as none where all pairs are asked again."""
+    try:
+        return read_evaluation(run, name)
+    except InputError:
+        if force:
+            return None
+        raise
+
+
+def _note_asker(run: RunFolder, document: EvaluationFile, tools: Tools) -> None:
+    """Add this process to those that evaluation.json says asked pairs, unless nothing is known of calls before it."""
+    path = evaluation_path(run, document.name)
+    if not document.askers and any(path.parent.glob("*/*.json")):
+        return
+    asker = Asker(commit=tools.commit(), machine=machine(), versions=versions())
+    if asker not in document.askers:
+        document = document.model_copy(update={"askers": (*document.askers, asker)})
+        write_json(path, document.model_dump(mode="json"))
 
 
 def _renew_tables(run: RunFolder) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import zipfile
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,8 @@ from cdpipe.core.names import path_part, visible
 from cdpipe.core.whole_file import whole_file
 from cdpipe.core.yamlfile import Document, validate
 from eval.core.output import made_parents, require_replaceable, unwritable
-from eval.core.provenance import git_commit, machine, versions
 from eval.leaderboard.calls import (
+    Asker,
     EvaluationFile,
     digest_method,
     digest_pair,
@@ -35,6 +35,7 @@ from eval.leaderboard.submission import (
     member_name,
 )
 from eval.running.runfolder import RunFolder, json_text
+from eval.running.scaling.merged_provenance import unite_fields
 from eval.scoring.scoring import METRICS_VERSION
 
 _HEAD = MANIFEST.encode()  # the name of the first member stands near the start of the file
@@ -65,8 +66,8 @@ def pack_submission(run: RunFolder, name: str, out: Path) -> int:
         "name": evaluation.name, "command": [_without_folders(word) for word in evaluation.command],
         "merge": evaluation.merge, "limit_s": evaluation.limit_s,
         "programs": _name_programs(evaluation.programs),
-        "plan": evaluation.plan, "split": evaluation.split, "metrics_version": METRICS_VERSION, "commit": git_commit(),
-        "machine": machine(), "versions": versions(), "pairs": parts,
+        "plan": evaluation.plan, "split": evaluation.split, "metrics_version": METRICS_VERSION,
+        **_unite_askers(evaluation.askers), "pairs": parts,
     }  # fmt: skip
     document = validate(Submission, Document(f"{run.path}: {evaluation.name}", told))
     manifest = json_text(document.model_dump()).encode()
@@ -98,6 +99,16 @@ def _require_readable(name: str, manifest: bytes, document: Submission) -> None:
             f"{name}: {len(document.pairs)} pairs are too many for one file ({error}): evaluate parts of the plan "
             "(--seeds) in folders of their own, and submit each"
         ) from error
+
+
+def _unite_askers(askers: Sequence[Asker]) -> dict[str, Any]:
+    """Return code, machine and packages that asked; fields that differ name all. Older evaluations did not tell."""
+    commits = {each.commit for each in askers}
+    return {
+        "commit": commits.pop() if len(commits) == 1 else None,
+        "machine": unite_fields([each.machine for each in askers]),
+        "versions": unite_fields([each.versions for each in askers]),
+    }
 
 
 def _name_programs(programs: Mapping[str, str]) -> dict[str, str]:

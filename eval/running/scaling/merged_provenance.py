@@ -47,7 +47,7 @@ def unite_provenance(
         "started": min(str(each.get("started")) for each in told),
         "command": command,
         "git_commit": told[0].get("git_commit") if len(commits) == 1 else None,
-        "machine": _unite_machines([part.get("machine") for part in parts]),
+        "machine": unite_fields([part.get("machine") for part in parts]),
         "parts": parts,
     }
     return united, notes
@@ -68,7 +68,7 @@ def resume_provenance(name: str, earlier: Mapping[str, Any], now: Mapping[str, A
     if "parts" not in earlier and earlier.get("machine") == now.get("machine"):
         return dict(now)
     parts = [*_parts(name, earlier), *_parts(name, now)]
-    return {**now, "machine": _unite_machines([part.get("machine") for part in parts]), "parts": parts}
+    return {**now, "machine": unite_fields([part.get("machine") for part in parts]), "parts": parts}
 
 
 def _require_alike(
@@ -125,12 +125,13 @@ def _parts(name: str, provenance: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [{"folder": name, **{key: provenance.get(key) for key in keys}}]
 
 
-def _unite_machines(machines: Sequence[Any]) -> Any:
-    if all(machine == machines[0] for machine in machines):
-        return machines[0]
-    known = [machine for machine in machines if isinstance(machine, Mapping)]
-    keys = list(dict.fromkeys(key for machine in known for key in machine))
-    return {key: _unite_field([machine.get(key) for machine in known]) for key in keys}
+def unite_fields(told: Sequence[Any]) -> Any:
+    """Return what several runs tell of their machines or packages: fields that differ name all values; {} of none."""
+    known = [each for each in told if isinstance(each, Mapping)]
+    if told and all(each == told[0] for each in told):
+        return told[0]
+    keys = list(dict.fromkeys(key for each in known for key in each))
+    return {key: _unite_field([each.get(key) for each in known]) for key in keys}
 
 
 def _unite_field(values: Sequence[Any]) -> Any:

@@ -294,7 +294,7 @@ def _unite_evaluations(runs: Sequence[RunFolder]) -> dict[str, dict[str, Any]]:
                 )
             holders.setdefault(name, run.path)
             pairs = dict.fromkeys([*_read_pairs(other, path), *_read_pairs(found, path)])
-            united[name] = {**other, "pairs": list(pairs)}
+            united[name] = {**other, "pairs": list(pairs), "askers": _unite_askers(other, found)}
     return united
 
 
@@ -304,6 +304,13 @@ def _read_pairs(evaluation: Mapping[str, Any], path: Path) -> list[tuple[str, in
         return _PAIRS.validate_python(evaluation.get("pairs", ()))
     except ValidationError as error:
         raise InputError(f"{path}: damaged: expected pairs of a scenario and a seed: evaluate again there") from error
+
+
+def _unite_askers(*evaluations: Mapping[str, Any]) -> list[Any]:
+    """Return what asked pairs, each once; [] where one of the evaluations does not tell."""
+    one, other = (evaluation.get("askers") or [] for evaluation in evaluations)
+    are_known = isinstance(one, list) and isinstance(other, list) and one and other
+    return [*one, *(each for each in other if each not in one)] if are_known else []
 
 
 def _take_evaluations(

@@ -14,10 +14,12 @@ import pytest
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.io.known_merge import read_alignment, read_known_merge, write_alignment
 from cdpipe.model.alignment import PathAlignment
+from eval.core.provenance import machine, versions
 from eval.core.terminal.progress import Silent
 from eval.leaderboard.calls import evaluation_folder, read_call, read_evaluation, require_an_answer
 from eval.leaderboard.given_merge import write_merge
 from eval.leaderboard.packing import pack_submission
+from eval.leaderboard.submission import Submission, read_submission
 from eval.oracles.merge import OracleMerge, align_by_truth
 from eval.running.predictions import add_predictions
 from eval.running.rescoring import rescore
@@ -125,6 +127,46 @@ def test_finished_pairs_are_kept_until_something_changes(evaluator: Evaluator) -
         evaluator.evaluate(counting, limit_s=5.0)
     assert n_calls() == 4
     assert evaluator.evaluate(counting + "\n", force=True).n_done == 2 and n_calls() == 6
+
+
+def test_what_asked_is_told_and_not_what_looked_on_or_packed(evaluator: Evaluator) -> None:
+    def evaluate(commit: str, **options: bool) -> list[str | None]:
+        evaluator.evaluate(tools=replace(TOOLS, commit=lambda: commit), **options)
+        return [each.commit for each in read_evaluation(evaluator.run, "mine").askers]
+
+    def pack() -> Submission:
+        file = evaluator.run.path.parent / "x.zip"
+        pack_submission(evaluator.run, "mine", file)
+        return read_submission(file).content
+
+    assert evaluate("a") == evaluate("b") == ["a"]  # the second asked nothing
+    packed = pack()
+    assert (packed.commit, packed.machine, packed.versions) == ("a", machine(), versions())
+    evaluator.run.cell(ONE_BOX, 20000, "mine").unlink()
+    assert evaluate("b") == ["a", "b"]
+    assert evaluate("c", force=True) == ["c"]
+    path = evaluation_folder(evaluator.run, "mine") / "evaluation.json"
+    older = {name: value for name, value in json.loads(path.read_text()).items() if name != "askers"}
+    path.write_text(json.dumps(older))
+    evaluator.run.cell(ONE_BOX, 20000, "mine").unlink()
+    assert evaluate("b") == []  # nothing is known of the other pair
+    packed = pack()
+    assert (packed.commit, packed.machine, packed.versions) == (None, {}, {})
+    path.write_text("{")
+    assert evaluate("c", force=True) == ["c"]
+
+
+def test_an_evaluation_of_two_machines_names_both(evaluator: Evaluator) -> None:
+    evaluator.evaluate()
+    path = evaluation_folder(evaluator.run, "mine") / "evaluation.json"
+    document = json.loads(path.read_text())
+    one = document["askers"][0]
+    other = {**one, "commit": "b", "machine": {**one["machine"], "cpu": "other"}}
+    path.write_text(json.dumps({**document, "askers": [one, other]}))
+    pack_submission(evaluator.run, "mine", evaluator.run.path.parent / "x.zip")
+    packed = read_submission(evaluator.run.path.parent / "x.zip").content
+    assert packed.commit is None and packed.machine["cpu"] == f"{one['machine']['cpu']} and other"
+    assert packed.machine["cores"] == one["machine"]["cores"] and packed.versions == one["versions"]
 
 
 LATER = GOOD.replace('"t_cd_s": 0.5', '"t_cd_s": 0.7')

@@ -249,6 +249,12 @@ def test_what_was_evaluated_comes_along_and_two_methods_of_one_name_do_not(
     other.write_text(json.dumps({**json.loads(other.read_text()), "merge": "given"}))
     with pytest.raises(InputError, match=r"under the name mine \(merge\): evaluate one of them"):
         merge_runs(copies, tmp_path / "two", keep="answers")
+    for number, path in enumerate(copy / "evaluations" / "mine" / "evaluation.json" for copy in copies):
+        askers = [{"commit": "a"}, *([{"commit": "b"}] * number)]
+        path.write_text(json.dumps({**json.loads(path.read_text()), "merge": "own", "askers": askers}))
+    merge_runs(copies, tmp_path / "askers", keep="answers")
+    united = tmp_path / "askers" / "evaluations" / "mine"
+    assert json.loads((united / "evaluation.json").read_text())["askers"] == [{"commit": "a"}, {"commit": "b"}]
     for pairs in (None, 3, [1], [["world"]], [["world", "x"]]):
         for copy in copies:
             path = copy / "evaluations" / "mine" / "evaluation.json"
