@@ -59,8 +59,8 @@ def parse_command(text: str, *, gets_merge: bool) -> tuple[str, ...]:
     """Return the words of a command; those with a dot or a slash that name a file or folder are made absolute.
 
     Raises:
-        InputError: It is no command, its program or script is not found, a placeholder is missing or unknown, or
-            {merge} stands there where no merge is given, or does not where one is.
+        InputError: It is no command, its program or script is not found, a placeholder is missing or unknown, a word
+            is not UTF-8, or {merge} stands there where no merge is given, or does not where one is.
     """
     try:
         words = shlex.split(text)
@@ -71,6 +71,7 @@ def parse_command(text: str, *, gets_merge: bool) -> tuple[str, ...]:
     _check_placeholders(text, gets_merge=gets_merge)
     _check_script(words[1:])
     words = [_find_program(words[0]), *map(_make_absolute, words[1:])]
+    _check_utf8(words)
     return tuple(words)
 
 
@@ -134,6 +135,15 @@ def _check_placeholders(text: str, *, gets_merge: bool) -> None:
         raise InputError("--command: {merge} is missing, and --merge says that one is given: add it, or --merge own")
     if not gets_merge and MERGE_WORD in found:
         raise InputError("--command: {merge} needs --merge given (by the truth) or --merge ours (by tunnelcd)")
+
+
+def _check_utf8(words: Sequence[str]) -> None:
+    """Refuse words that no evaluation.json can hold."""
+    for word in words:
+        try:
+            word.encode()
+        except UnicodeEncodeError as error:
+            raise InputError(f"--command: {visible(word)} is not UTF-8: give the file another name") from error
 
 
 def _find_program(word: str) -> str:

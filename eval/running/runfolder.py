@@ -38,7 +38,7 @@ from cdpipe.core import files
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArraySpec, read_npz
 from cdpipe.core.geometry.voxel import require_reachable
-from cdpipe.core.names import path_part
+from cdpipe.core.names import path_part, visible
 from cdpipe.core.whole_file import whole_file
 from eval.core.output import make_writable, remove, require_no_links
 from eval.core.provenance import FORMAT_VERSION, TOOL
@@ -344,9 +344,20 @@ def _require_format(path: Path, document: Mapping[str, Any]) -> None:
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write JSON that appears whole or not at all; numpy scalars become plain numbers."""
+    """Write JSON that appears whole or not at all; numpy scalars become plain numbers.
+
+    Raises:
+        InputError: A text of it, as a name of a file in a command line, is not UTF-8: it could not be read again.
+    """
+    text = json_text(document)
+    try:
+        if "\\ud" in text:  # half a surrogate pair stands for a byte that is not UTF-8
+            json.dumps(json.loads(text), ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        odd = visible(error.object[max(error.start - 30, 0) : error.end + 10])
+        raise InputError(f"{path}: cannot hold {odd}, which is not UTF-8: give it another name") from error
     with whole_file(path) as partial:
-        partial.write_text(json_text(document))
+        partial.write_text(text)
 
 
 def json_text(document: Mapping[str, Any]) -> str:

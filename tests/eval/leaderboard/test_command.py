@@ -21,6 +21,7 @@ WHOLE = "{before} {after} {out}"
         ("", False, "is empty"),
         ("python 'x", False, "No closing quotation"),
         (f"no-such-program-1 {WHOLE}", False, "no such program"),
+        (f"{sys.executable} x\udcff {WHOLE}", False, r"x\udcff is not UTF-8"),
         ("python x.py {before} {after}", False, "{out} is missing"),
         ("python x.py {befor} {after} {out}", False, 'did you mean "before"'),
         (f"python x.py {WHOLE} {{merge}}", False, "needs --merge given"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from cdpipe.model.alignment import PathAlignment
 from eval.core.provenance import machine, versions
 from eval.core.terminal.progress import Silent
 from eval.leaderboard.calls import evaluation_folder, read_call, read_evaluation, require_an_answer
+from eval.leaderboard.evaluation import Method, evaluate_command
 from eval.leaderboard.given_merge import write_merge
 from eval.leaderboard.packing import pack_submission
 from eval.leaderboard.submission import Submission, read_submission
@@ -127,6 +129,19 @@ def test_finished_pairs_are_kept_until_something_changes(evaluator: Evaluator) -
         evaluator.evaluate(counting, limit_s=5.0)
     assert n_calls() == 4
     assert evaluator.evaluate(counting + "\n", force=True).n_done == 2 and n_calls() == 6
+
+
+def test_words_that_are_not_utf8_are_refused_before_a_pair_is_asked(evaluator: Evaluator) -> None:
+    def simulated(*_: object) -> None:
+        raise AssertionError("nothing must be made")
+
+    tools = replace(TOOLS, simulate=simulated)
+    with pytest.raises(InputError, match=r"provenance\.json: cannot hold .*x\\udcff.*, which is not UTF-8"):
+        evaluator.evaluate(command=("tunnelcd", "x\udcff"), tools=tools)
+    method = Method("mine", (sys.executable, "x\udcff", "\U0001f600", "{before}"), "given")
+    with pytest.raises(InputError, match=r"evaluation\.json: cannot hold .*x\\udcff.*, which is not UTF-8"):
+        evaluate_command(evaluator.plan, evaluator.run, method, command=("tunnelcd", "\U0001f600"), tools=tools)
+    assert evaluator.run.provenance()["command"] == "tunnelcd '\U0001f600'"
 
 
 def test_what_asked_is_told_and_not_what_looked_on_or_packed(evaluator: Evaluator) -> None:

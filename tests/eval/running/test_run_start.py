@@ -54,6 +54,14 @@ def test_missing_extras_are_named_all_at_once_before_anything_is_made(
     assert command("run", tmp_path / "plan.yaml", "--out", tmp_path / "list", "--dry-run")[0] == 0
 
 
+def test_words_that_are_not_utf8_are_refused_before_anything_is_made(tmp_path: Path) -> None:
+    run = start_run_folder(tmp_path / "run")
+    plan = plan_of(tmp_path, "{preset: voxel-diff}")
+    with pytest.raises(InputError, match=r"provenance\.json: cannot hold .*x\\udcff.*, which is not UTF-8"):
+        run_plan(plan, run, command=("tunnelcd", "run", "x\udcff"), tools=Tools(simulate=forbidden))
+    assert not any(run.path.iterdir())
+
+
 def test_regions_from_the_truth_need_a_source_that_does_not_cut_out_itself(
     tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
