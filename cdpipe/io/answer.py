@@ -71,6 +71,7 @@ from cdpipe.model.report import (
     SurfaceRegion,
 )
 
+ANSWER_FILES = ("answer.json", "answer.npz")
 # Fields of an object that answer.json holds as they are.
 _OF_SURFACE = (*SURFACE, *SURFACE_UNROLLED)
 _OBJECT_FIELDS = ("session", "kind", "region", "score", "partner")
@@ -173,7 +174,7 @@ def write_failure(
 ) -> None:
     """Write the record of a case without an answer, with 10,000 letters of its error and the seconds until then."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in ("answer.json", "answer.npz"):
+    for name in ANSWER_FILES:
         (folder / name).unlink(missing_ok=True)
     document: dict[str, Any] = {"status": status, "error": error[:MAX_ERROR], "method": method}
     document |= {"seconds": dict(seconds or {}), "evidence": dict(evidence)}

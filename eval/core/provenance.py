@@ -45,6 +45,12 @@ def digest_parts(parts: Mapping[str, str]) -> str:
     return _digest_text("{" + ",".join(f"{json.dumps(name)}:{parts[name]}" for name in sorted(parts)) + "}")
 
 
+def digest_file(path: Path) -> str:
+    """Return the SHA-256 of a file, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def _digest_text(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

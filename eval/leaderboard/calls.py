@@ -21,13 +21,13 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_json
 from cdpipe.core.names import path_part
 from cdpipe.core.yamlfile import Document, Settings, validate
+from cdpipe.io.answer import ANSWER_FILES
 from eval.core.provenance import digest
 from eval.leaderboard.given_merge import MergeMode
 from eval.plans.worlds import world_slug
 from eval.running.runfolder import RunFolder
 
 _EXPECTED = "--force answers all pairs again"
-ANSWER_FILES = ("answer.json", "answer.npz")
 
 
 class Asker(Settings):

@@ -9,7 +9,6 @@ dot or a slash. Others may be names of something else: `train` beside a folder `
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import shlex
@@ -28,6 +27,7 @@ from typing import BinaryIO
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import visible
 from cdpipe.core.yamlfile import suggest
+from eval.core.provenance import digest_file
 
 SESSION_WORDS = ("before", "after", "out")
 MERGE_WORD = "merge"
@@ -170,8 +170,7 @@ def _check_script(words: Sequence[str]) -> None:
 
 def _digest_file(path: Path) -> str:
     try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return digest_file(path)
     except OSError as error:
         raise InputError(
             f"--command: {visible(str(path))}: cannot be read ({error.strerror}), so a change of it would not be "

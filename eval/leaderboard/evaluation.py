@@ -21,12 +21,11 @@ from tempfile import TemporaryDirectory
 
 from cdpipe.core.errors import InputError, MergeFailedError, TunnelcdError
 from cdpipe.core.names import path_part
-from cdpipe.io.answer import write_failure
+from cdpipe.io.answer import ANSWER_FILES, write_failure
 from eval.core.output import remove
 from eval.core.provenance import digest, machine, versions
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.leaderboard.calls import (
-    ANSWER_FILES,
     Asker,
     CallFile,
     EvaluationFile,

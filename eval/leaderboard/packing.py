@@ -14,6 +14,7 @@ from cdpipe.core.files import parse_json, read_bytes
 from cdpipe.core.names import path_part, visible
 from cdpipe.core.whole_file import whole_file
 from cdpipe.core.yamlfile import Document, validate
+from cdpipe.io.answer import ANSWER_FILES
 from eval.core.output import made_parents, require_replaceable, unwritable
 from eval.leaderboard.calls import (
     Asker,
@@ -26,7 +27,6 @@ from eval.leaderboard.calls import (
     read_evaluation,
 )
 from eval.leaderboard.submission import (
-    FILES,
     MANIFEST,
     MOST_BYTES,
     PairPart,
@@ -130,7 +130,8 @@ def _collect(run: RunFolder, evaluation: EvaluationFile) -> tuple[list[PairPart]
         call = read_call(run, evaluation.name, scenario, seed)
         cell = run.read_cell(run.cell(scenario, seed, evaluation.name))
         held = digest_pair(run.pair(scenario, seed))
-        is_there = call is not None and cell is not None and (not call.pair_digest or (answer / FILES[0]).is_file())
+        has_answer = (answer / ANSWER_FILES[0]).is_file()
+        is_there = call is not None and cell is not None and (not call.pair_digest or has_answer)
         if call is None or cell is None or not is_there or cell["row"].get("metrics_version") != METRICS_VERSION:
             mistakes.append(f"{scenario} {seed}")
         elif call.method_digest != called:
@@ -140,7 +141,7 @@ def _collect(run: RunFolder, evaluation: EvaluationFile) -> tuple[list[PairPart]
         elif is_exchanged(call, answer):
             mistakes.append(f"{scenario} {seed} (its answer was exchanged)")
         else:
-            files = {file: _describe(answer / file) for file in FILES if (answer / file).is_file()}
+            files = {file: _describe(answer / file) for file in ANSWER_FILES if (answer / file).is_file()}
             part = {"scenario": scenario, "seed": seed, "pair_digest": call.pair_digest, "seconds": call.seconds,
                     "row": cell["row"], "files": files}  # fmt: skip
             parts.append(validate(PairPart, Document(f"{run.path}: {scenario} {seed}", part)))

@@ -26,7 +26,9 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files import list_members, parse_json, read_member, require_plain_file
 from cdpipe.core.names import LONGEST, visible
 from cdpipe.core.yamlfile import Document, Settings, validate
+from cdpipe.io.answer import ANSWER_FILES
 from cdpipe.io.answer_parts import MAX_ERROR
+from eval.core.provenance import digest_file
 from eval.leaderboard.calls import digest_pair
 from eval.leaderboard.given_merge import MergeMode
 from eval.running.cell_rows import TEXT_COLUMNS
@@ -37,7 +39,6 @@ from eval.scoring.scoring import METRICS_VERSION, score_stored
 from eval.truth.ground_truth import load_ground_truth
 
 MANIFEST = "submission.json"
-FILES = ("answer.json", "answer.npz")
 MOST_BYTES = 4 << 30
 _EXPECTED = "expected a file that `tunnelcd submit DIR --out FILE.zip` makes"
 _ROUNDING = 1e-6
@@ -135,7 +136,7 @@ def read_submission(path: Path) -> CheckedFile:
                 raise ValueError(f"{name} has {members[name].file_size} bytes, {part.n_bytes} were packed")
             if hashlib.sha256(read_member(archive, members[name]).data).hexdigest() != part.sha256:
                 raise ValueError(f"{name} is not the file that was packed: its digest differs")
-    return CheckedFile(path, _digest_file(path), document)
+    return CheckedFile(path, digest_file(path), document)
 
 
 def score_again(found: CheckedFile, run: RunFolder) -> int:
@@ -204,7 +205,7 @@ def check_rows(document: Submission) -> None:
         if pair.row.get("variant") != document.name or pair.row.get("metrics_version") != METRICS_VERSION:
             raise ValueError(f"the row of {visible(pair.scenario)} {pair.seed} is of another method or other metrics")
         is_ok = pair.row.get("status") == "ok"
-        if not isinstance(pair.row.get("status"), str) or (is_ok and set(pair.files) != set(FILES)):
+        if not isinstance(pair.row.get("status"), str) or (is_ok and set(pair.files) != set(ANSWER_FILES)):
             raise ValueError(f"the row of {visible(pair.scenario)} {pair.seed} has no status, or no answer")
         if not pair.files:
             _require_no_figures(pair)
@@ -244,11 +245,6 @@ def _opened(path: Path, n_bytes: int) -> Iterator[tuple[zipfile.ZipFile, Mapping
 def member_name(number: int, file: str) -> str:
     """Return the name in the archive of a file of the answer to a pair."""
     return f"answers/{number:05d}/{file}"
-
-
-def _digest_file(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _is_same(stored: Any, scored: Any) -> bool:

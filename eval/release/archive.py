@@ -19,6 +19,7 @@ from cdpipe.core.files import list_members, read_bytes, read_member, require_pla
 from cdpipe.core.names import LONGEST, visible
 from cdpipe.core.whole_file import whole_file
 from eval.core.output import new_folder
+from eval.core.provenance import digest_file
 from eval.core.terminal.progress import RunProgress, Silent
 
 SESSIONS, TRUTH, SUMS = "sessions", "truth", "SHA256SUMS"
@@ -32,12 +33,6 @@ _EXPECTED = "expected a file made by `tunnelcd dataset --release`, copy it again
 def list_files(folder: Path) -> list[str]:
     """Return the names of all files below a folder, with slashes, sorted."""
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-
-
-def digest_file(path: Path) -> str:
-    """Return the SHA-256 of a file, hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_sums(folder: Path, progress: RunProgress | None = None) -> None:

@@ -15,7 +15,8 @@ import pandas as pd
 from cdpipe.core.names import visible
 from cdpipe.core.whole_file import whole_file
 from cdpipe.io.session import read_session
-from eval.release.archive import SESSIONS, TRUTH, digest_file, list_files
+from eval.core.provenance import digest_file
+from eval.release.archive import SESSIONS, TRUTH, list_files
 from eval.release.content import Release, ReleasePair
 from eval.release.croissant import Column, FileGroup, Table, describe_croissant, write_croissant
 from sim.session.truth import read_pair_truth

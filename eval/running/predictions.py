@@ -22,6 +22,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.names import folded, path_part, require_table_name, visible
 from cdpipe.core.whole_file import whole_file
 from cdpipe.core.yamlfile import suggest
+from cdpipe.io.answer import ANSWER_FILES
 from cdpipe.model.config import preset_names
 from eval.core.output import copy_folder, remove
 from eval.core.tablefile import read_table
@@ -36,7 +37,6 @@ from eval.running.runfolder import RunFolder, open_run_folder, write_json, write
 from eval.scoring.scoring import METRICS_VERSION, score_stored
 from eval.truth.ground_truth import load_ground_truth
 
-_FILES = ("answer.json", "answer.npz")
 _TOLD = 5
 
 
@@ -74,7 +74,7 @@ def add_predictions(run: RunFolder, folder: Path, name: str, progress: RunProgre
         scenario, seed = document["row"]["scenario"], int(pair.name)
         answer = run.answer(scenario, seed, name)
         remove(answer)
-        for file in reversed(_FILES):  # answer.json last: after an interrupt the same call begins anew
+        for file in reversed(ANSWER_FILES):  # answer.json last: after an interrupt the same call begins anew
             if (found[pair] / file).is_file():
                 with whole_file(answer / file) as partial:
                     shutil.copyfile(found[pair] / file, partial)
@@ -114,10 +114,10 @@ def evaluate(predict: Callable[[Path, Path], object], run: Path | str, name: str
             answer.mkdir()
             copy_pair(original, pair)
             predict(pair, answer)
-            if not (answer / _FILES[0]).is_file():
+            if not (answer / ANSWER_FILES[0]).is_file():
                 raise InputError(
-                    f"pair {number + 1} of {len(originals)}: the function wrote no {_FILES[0]} to its second argument: "
-                    'write one of status "failed" where there is no answer'
+                    f"pair {number + 1} of {len(originals)}: the function wrote no {ANSWER_FILES[0]} to its second "
+                    'argument: write one of status "failed" where there is no answer'
                 )
             # answers stand beside the pairs that are still to come: their names tell nothing before the last call
             copy_folder(answer, kept / str(number))
@@ -232,7 +232,7 @@ def _find_unscored(run: RunFolder, identity: Mapping[str, Any], prediction: Path
     names = identity["scenario"], identity["seed"], identity["variant"]
     answer = run.answer(*names)
     is_scored = run.read_cell(run.cell(*names)) is not None
-    _, others, unreadable = filecmp.cmpfiles(answer, prediction, _FILES, shallow=False)
+    _, others, unreadable = filecmp.cmpfiles(answer, prediction, ANSWER_FILES, shallow=False)
     if is_scored or not answer.exists() or not (others or any((answer / name).exists() for name in unreadable)):
         return []
     return [f"{answer}: holds an answer that is not scored: `tunnelcd score {run.path}` takes it in, or remove it"]

@@ -18,9 +18,10 @@ from cdpipe.core.files import read_json
 from cdpipe.core.names import visible
 from cdpipe.core.whole_file import whole_file
 from cdpipe.training.shard import FIELDS, SUFFIX, read_about, split_of
+from eval.core.provenance import digest_file
 from eval.plans.splits import version_name
 from eval.plans.worlds import world_slug
-from eval.release.archive import digest_file, write_sums_of
+from eval.release.archive import write_sums_of
 from eval.release.croissant import FILE, Column, FileGroup, Table, describe_croissant, write_croissant
 
 COUNTS = ("n_before", "n_after", "n_covered", "n_positive", "n_negative", "n_changes", "n_observable")

@@ -122,7 +122,8 @@ def _release_or_unpack(
     quiet: bool,
     with_truth: bool,
 ) -> None:
-    from eval.release.archive import digest_file, unpack_release
+    from eval.core.provenance import digest_file
+    from eval.release.archive import unpack_release
     from eval.release.content import load_release
     from eval.release.making import make_release
 

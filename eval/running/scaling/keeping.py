@@ -6,7 +6,6 @@ scenario as drawn and the seed, and the digest of all of its files (`eval.runnin
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,7 +16,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_json
 from cdpipe.core.yamlfile import Document, Settings, validate
 from eval.core.output import remove
-from eval.core.provenance import digest
+from eval.core.provenance import digest, digest_file
 from eval.running.cell_file import NO_KEY
 from eval.running.runfolder import NEW_TABLES, RunFolder, write_json
 from eval.running.stages.stage_cache import files_digest
@@ -110,8 +109,7 @@ def _list_files(pair: Path) -> list[Path]:
 
 def _digest_without_paths(file: Path, named: Mapping[str, str]) -> str:
     if file.name not in ("changes.json", "session.json"):
-        with file.open("rb") as content:
-            return hashlib.file_digest(content, "sha256").hexdigest()
+        return digest_file(file)
     document = read_json(file, _EXPECTED)
     if isinstance(document.get("scenario"), dict):
         document |= {"scenario": without_paths(document["scenario"], named), "files": sorted(named.values())}

@@ -21,6 +21,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_json, read_npz
+from cdpipe.io.answer import ANSWER_FILES
 from eval.core.output import copy_folder, new_folder
 from eval.core.provenance import digest, now
 from eval.core.terminal.progress import RunProgress, Silent
@@ -32,7 +33,6 @@ from eval.running.scaling.keeping import digest_files, list_records, read_droppe
 from eval.running.scaling.merged_provenance import unite_provenance
 from eval.running.scaling.shards import number_pairs, stored_shard
 
-_ANSWER = ("answer.json", "answer.npz")
 # what two answers of one method share (`eval.leaderboard.calls.digest_method`), and the plan that they are of
 _OF_A_METHOD = ("command", "programs", "merge", "limit_s", "plan", "plan_digest", "split")
 
@@ -193,7 +193,7 @@ def find_differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> Ite
 
 def _digest_answer(folder: Path) -> str:
     """Return the digest of a stored answer without its seconds; "" where there is none."""
-    document, arrays = (folder / name for name in _ANSWER)
+    document, arrays = (folder / name for name in ANSWER_FILES)
     if not document.is_file():
         return ""
     # the key of the cell stands for its settings, which name weights by their place on one machine
@@ -214,7 +214,7 @@ def _take_cell(source: Path, target: Path, name: Path) -> None:
     answer = _answer_of(name.as_posix())
     if (source / answer).is_dir():
         (target / answer).mkdir(parents=True)
-        for file in _ANSWER:
+        for file in ANSWER_FILES:
             if (source / answer / file).is_file():
                 shutil.copyfile(source / answer / file, target / answer / file)
     (target / name).parent.mkdir(parents=True, exist_ok=True)

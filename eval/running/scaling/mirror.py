@@ -19,13 +19,13 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.files import parse_json
 from cdpipe.core.files.json_file import MAX_BYTES
 from cdpipe.core.whole_file import whole_file
+from cdpipe.io.answer import ANSWER_FILES
 from eval.core.provenance import TOOL
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.running.pair_run import Pair
 from eval.running.runfolder import RunFolder, read_json, write_json
 from eval.running.scaling.keeping import RECORDS, dropped_file, list_records
 
-_ANSWER = ("answer.npz", "answer.json")
 _PART = r"(?!\.)[A-Za-z0-9._=,-]{1,210}"
 _CELL = re.compile(rf"cells/{_PART}/\d{{1,15}}/{_PART}\.json", re.ASCII)
 _DROPPED = re.compile(rf"{RECORDS}/{_PART}/\d{{1,15}}\.json", re.ASCII)
@@ -168,7 +168,8 @@ class Mirror:
 
     def _copy_cell(self, run: RunFolder, cell: Path) -> None:
         answer = run.path / "answers" / cell.relative_to(run.path / "cells").with_suffix("")
-        self._put(run, [*(answer / name for name in _ANSWER if (answer / name).is_file()), cell])
+        files = [answer / name for name in reversed(ANSWER_FILES)]  # answer.json says that the other is whole
+        self._put(run, [*(file for file in files if file.is_file()), cell])
 
     def copy_tables(self, run: RunFolder) -> None:
         """Copy provenance and tables.

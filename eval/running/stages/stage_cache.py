@@ -8,7 +8,6 @@ not at all; a damaged one is ignored.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import zipfile
 from collections.abc import Iterable, Mapping
@@ -24,7 +23,7 @@ import cdpipe
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArrayType, read_npz
 from cdpipe.core.whole_file import whole_file
-from eval.core.provenance import digest
+from eval.core.provenance import digest, digest_file
 
 MAPS = "maps"
 # Maps are large: at most this much of them is stored in a run folder.
@@ -105,8 +104,7 @@ def files_digest(folder: Path, paths: Iterable[Path]) -> str:
     """Return the digest of the names and contents of files below a folder."""
     found = {}
     for path in paths:
-        with path.open("rb") as file:
-            found[path.relative_to(folder).as_posix()] = hashlib.file_digest(file, "sha256").hexdigest()
+        found[path.relative_to(folder).as_posix()] = digest_file(path)
     return digest(found)
 
 

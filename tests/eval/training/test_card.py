@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from cdpipe.training.shard import FIELDS, encode_shard
-from eval.release.archive import digest_file, read_sums
+from eval.core.provenance import digest_file
+from eval.release.archive import read_sums
 from eval.training.dataset_card import COUNTS, INDEX_COLUMNS, card, write_card
 
 
