@@ -175,7 +175,9 @@ def take_known_merge(
 def _warn_of_misfit(
     found: Hypothesis, known: Float64Array, positions: Float64Array, near_m: float, config: MergeConfig
 ) -> bool:
-    """Warn, and return True, where scans fit elsewhere than a known merge has them or nowhere, or cannot tell.
+    """Warn where the scans fit elsewhere than a known merge puts them, do not fit around it, or cannot tell.
+
+    True where nothing is left to tell: a warning was given, or the scans slide along a smooth drift.
 
     Args:
         found: The walk that started at the known merge.
@@ -197,7 +199,7 @@ def _warn_of_misfit(
         far_m = moved_m[moved_m > near_m]
         slides = not ratio >= config.min_hessian_ratio  # along a smooth drift
         if slides or len(far_m) == 0 or len(far_m) < max(min(2, len(moved_m)), _FAR_SHARE * len(moved_m)):
-            return False
+            return slides
         told = f"the scans fit {np.median(far_m):.1f} m beside it, at {len(far_m)} of {len(moved_m)} places"
     text = f"known merge: {told}: are both sessions in one frame? Without a known merge, it is searched for"
     warnings.warn(text, InputWarning, stacklevel=2)

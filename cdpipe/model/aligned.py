@@ -11,6 +11,7 @@ from cdpipe.model.report import ChangeReport
 
 # Most by which odometry that holds errs between two keyframes, as where a recorded odometry is told to be lost.
 _LEAP_M = 1.0
+_DRIFT_SHARE = 0.05  # of the way between two keyframes: drift, and bends of it
 
 
 def alignment_of(report: ChangeReport, after_odom_T_sensor: Float64Array) -> PathAlignment:
@@ -56,11 +57,18 @@ def merge_at_scans(report: ChangeReport, scans: Int64Array) -> Float64Array:
 
 
 def is_torn(report: ChangeReport, after_odom_T_sensor: Float64Array) -> bool:
-    """Return whether the after odometry lost its way: between two keyframes it errs by a metre."""
-    scans, local = np.sort(report.keyframe_scans[1]), report.local_before_T_after
-    if local is None or len(scans) < 2:
+    """Return whether the after odometry lost its way: between two places of the merge it errs by more than a metre."""
+    scans = aligned_scans(report, len(after_odom_T_sensor))
+    if report.local_before_T_after is None or len(scans) < 2:
         return False
     odom_T_keyframe = after_odom_T_sensor[scans]
     map_T_keyframe = merge_at_scans(report, scans) @ odom_T_keyframe
     recorded, found = (invert(each[:-1]) @ each[1:] for each in (odom_T_keyframe, map_T_keyframe))
-    return bool(np.any(np.linalg.norm(recorded[:, :3, 3] - found[:, :3, 3], axis=1) > _LEAP_M))
+    err_m = np.linalg.norm(recorded[:, :3, 3] - found[:, :3, 3], axis=1)
+    return bool(np.any(err_m > _LEAP_M + _DRIFT_SHARE * np.linalg.norm(recorded[:, :3, 3], axis=1)))
+
+
+def aligned_scans(report: ChangeReport, n_scans: int) -> Int64Array:
+    """Return the after scans at which a report states its merge, in order: its keyframes, all where it names none."""
+    named = report.keyframe_scans[1]
+    return np.sort(named) if len(named) else np.arange(n_scans)

@@ -10,7 +10,7 @@ from cdpipe.core.geometry import Float64Array, Int64Array, travelled_m
 from cdpipe.core.geometry.path_frames import path_frames
 
 _BIN_M = 1.0
-# Rock that lies so much farther out than in most of so many metres before and behind is that of a crosscut or a raise.
+# Where the drift is so much wider than in most of so many metres before and behind, a crosscut or a raise opens.
 _AROUND, _BEYOND_M = 8, 1.0
 
 
@@ -20,7 +20,7 @@ def unroll(points: Float64Array, odom_T_sensor: Float64Array) -> tuple[Float64Ar
     The chainage is that of the nearest pose, plus the way from there along the direction of the path. Where a session
     passes a place twice, the nearer pass counts. In each metre of chainage the axis lies midway between the walls, and
     between roof and floor. Where one of them opens, by a crosscut or a raise, it is taken to be where it mostly is
-    within 8 m of chainage.
+    in the 8 metres before and behind in which there is rock.
 
     A wall has one side on both ways past a turn on the spot, as seen on the longer way (`path_frames`); a bend that is
     metres wide turns the direction, and swaps left and right. So does a session that is driven the other way.
@@ -60,7 +60,9 @@ def _middles(values: Float64Array, group: Int64Array) -> Float64Array:
     low, high = np.full(group.max() + 1, np.inf), np.full(group.max() + 1, -np.inf)
     np.minimum.at(low, group, values)
     np.maximum.at(high, group, values)
-    low_around, high_around = (median_filter(each, 2 * _AROUND + 1, mode="reflect") for each in (low, high))
-    low = np.where(low < low_around - _BEYOND_M, low_around, low)
-    high = np.where(high > high_around + _BEYOND_M, high_around, high)
+    around = (median_filter(each, 2 * _AROUND + 1, mode="reflect") for each in (low, high, high - low))
+    low_around, high_around, width_around = around
+    is_open = high - low > width_around + _BEYOND_M  # a swerve moves both sides
+    low = np.where(is_open & (low < low_around - _BEYOND_M), low_around, low)
+    high = np.where(is_open & (high > high_around + _BEYOND_M), high_around, high)
     return np.asarray((low + high) / 2)

@@ -213,7 +213,7 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     usable = {table: without_unusable(frame) for table, frame in collected.items()}
     usable["results"] = without_costs_of_failures(usable["results"])
     tables = {
-        "summary": summarise(_with_counted_alarms(usable["results"]), keyframes=usable["keyframes"]),
+        "summary": summarise(_with_counted_alarms(run, usable["results"]), keyframes=usable["keyframes"]),
         **{table: collected[table] for table in SURFACE_TABLES},
         "effects": effects(usable["results"]),
         "merge": merge_table(usable["results"], read_targets(run.stored_provenance())),
@@ -238,8 +238,10 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     return results
 
 
-def _with_counted_alarms(results: pd.DataFrame) -> pd.DataFrame:
-    if "is_alarm" not in results or results["is_alarm"].isna().all():  # of a plan that ends at the merge
+def _with_counted_alarms(run: RunFolder, results: pd.DataFrame) -> pd.DataFrame:
+    plan = run.stored_provenance().get("plan")
+    ends_at_merge = isinstance(plan, Mapping) and plan.get("until") == "merge"
+    if "is_alarm" not in results or ends_at_merge:
         return results
     return results.assign(is_alarm=count_alarms(results))
 

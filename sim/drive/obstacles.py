@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from cdpipe.core.errors import ScenarioError
-from cdpipe.core.geometry import Float64Array
+from cdpipe.core.geometry import Float64Array, Int64Array
 from scenarios.schema import Scenario
 from sim.geometry.line import STEP_M
 from sim.geometry.raycast import measure_room
@@ -93,47 +93,52 @@ def pass_obstacles(
     Returns:
         Number of the obstacle that cannot be passed and the sample at which it bars the way, or None.
     """
-    sides: dict[int, int] = {}
+    visits = [(number, visit) for number, (near_low, _) in enumerate(obstacles) for visit in _list_visits(near_low)]
+    sides: dict[int, int] = {}  # of visits: 1 left, -1 right; the way back passes an obstacle on its other side
     while True:
         inner = low.copy(), high.copy()
-        barred = _pass_each(wanted, *inner, obstacles, sides)
+        barred = _pass_each(wanted, *inner, obstacles, visits, sides)
         if barred is None:
             low[:], high[:] = inner
             return None
-        number, sample = barred
-        free = np.flatnonzero(np.isnan(obstacles[number][0][sample:]))
-        abreast = slice(sample, sample + int(free[0]) if len(free) else len(wanted))
-        group = [each for each in range(number) if np.isfinite(obstacles[each][0][abreast]).any()][-_MOST_ABREAST:]
+        number, there = visits[barred]
+        group = [each for each in range(barred) if len(np.intersect1d(visits[each][1], there))][-_MOST_ABREAST:]
         tries = []
         for chosen in product((-1, 1), repeat=len(group) + 1):
-            tried = {**sides, **dict(zip((*group, number), chosen, strict=True))}
+            tried = {**sides, **dict(zip((*group, barred), chosen, strict=True))}
             inner = low.copy(), high.copy()
-            if _pass_each(wanted, *inner, obstacles[: number + 1], tried) is None:
+            if _pass_each(wanted, *inner, obstacles, visits[: barred + 1], tried) is None:
                 detour_m = np.maximum(inner[0] - wanted, 0.0) + np.maximum(wanted - inner[1], 0.0)
                 tries.append((float(detour_m.sum()), tried))
         if not tries:
-            return barred
+            return number, int(there[0])
         sides = min(tries, key=itemgetter(0))[1]
 
 
+def _list_visits(near_low: Float64Array) -> list[Int64Array]:
+    """Return the samples (V,) of each time that a line comes by an obstacle, which forbids offsets there."""
+    samples = np.flatnonzero(np.isfinite(near_low))
+    return [each for each in np.split(samples, np.flatnonzero(np.diff(samples) > 1 / STEP_M) + 1) if len(each)]
+
+
 def _pass_each(
-    wanted: Float64Array, low: Float64Array, high: Float64Array, obstacles: Sequence[Span], sides: Mapping[int, int]
-) -> tuple[int, int] | None:
-    """Narrow the bounds by one obstacle after another, those with a side on that side; else as `pass_obstacles`."""
-    for number, (near_low, near_high) in enumerate(obstacles):
-        sample = sidestep(wanted, low, high, near_low, near_high, sides.get(number, 0))
-        if sample is not None:
-            return number, sample
+    wanted: Float64Array,
+    low: Float64Array,
+    high: Float64Array,
+    obstacles: Sequence[Span],
+    visits: Sequence[tuple[int, Int64Array]],
+    sides: Mapping[int, int],
+) -> int | None:
+    """Narrow the bounds by one visit after another, those with a side on that side; return the first without room."""
+    for place, (number, visit) in enumerate(visits):
+        near_low, near_high = obstacles[number]
+        if not _pass_one(wanted, low, high, visit, (near_low[visit], near_high[visit]), sides.get(place, 0)):
+            return place
     return None
 
 
 def sidestep(
-    wanted: Float64Array,
-    low: Float64Array,
-    high: Float64Array,
-    near_low: Float64Array,
-    near_high: Float64Array,
-    side: int = 0,
+    wanted: Float64Array, low: Float64Array, high: Float64Array, near_low: Float64Array, near_high: Float64Array
 ) -> int | None:
     """Narrow the bounds of a line in place so that it passes an obstacle on one side, each time it comes by.
 
@@ -143,26 +148,34 @@ def sidestep(
         high: (N,) upper bound; changed in place.
         near_low: (N,) lowest offset that the obstacle forbids, NaN where it is far.
         near_high: (N,) highest one.
-        side: 1 to pass it on the left, -1 on the right, 0 on the side that is nearer.
 
     Returns:
-        The first sample where that side, or neither, leaves room, or None.
+        The first sample where neither side leaves room, or None.
     """
-    stations = np.flatnonzero(np.isfinite(near_low))
-    for visit in np.split(stations, np.flatnonzero(np.diff(stations) > 1 / STEP_M) + 1):
-        if len(visit) == 0 or (near_low[visit] > high[visit]).all() or (near_high[visit] < low[visit]).all():
-            continue
-        shift_left = np.maximum(near_high[visit] - wanted[visit], 0.0).max()
-        shift_right = np.maximum(wanted[visit] - near_low[visit], 0.0).max()
-        fits_left = side >= 0 and (near_high[visit] <= high[visit]).all()
-        fits_right = side <= 0 and (near_low[visit] >= low[visit]).all()
-        if fits_left and (shift_left <= shift_right or not fits_right):
-            low[visit] = np.maximum(low[visit], near_high[visit])
-        elif fits_right:
-            high[visit] = np.minimum(high[visit], near_low[visit])
-        else:
+    for visit in _list_visits(near_low):
+        if not _pass_one(wanted, low, high, visit, (near_low[visit], near_high[visit])):
             return int(visit[0])
     return None
+
+
+def _pass_one(
+    wanted: Float64Array, low: Float64Array, high: Float64Array, visit: Int64Array, forbidden: Span, side: int = 0
+) -> bool:
+    """Narrow the bounds at the samples (V,) of one visit, to a side (1 left, -1 right, 0 any); False without room."""
+    near_low, near_high = forbidden
+    if (near_low > high[visit]).all() or (near_high < low[visit]).all():
+        return True
+    shift_left = np.maximum(near_high - wanted[visit], 0.0).max()
+    shift_right = np.maximum(wanted[visit] - near_low, 0.0).max()
+    fits_left = side >= 0 and (near_high <= high[visit]).all()
+    fits_right = side <= 0 and (near_low >= low[visit]).all()
+    if fits_left and (shift_left <= shift_right or not fits_right):
+        low[visit] = np.maximum(low[visit], near_high)
+    elif fits_right:
+        high[visit] = np.minimum(high[visit], near_low)
+    else:
+        return False
+    return True
 
 
 def find_boulders(

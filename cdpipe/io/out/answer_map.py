@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,14 +11,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from cdpipe.core.errors import InputError
+from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.geometry import Float64Array, Int32Array, Int64Array
 from cdpipe.core.progress import Progress
 from cdpipe.io.answer import Answer, read_answer
 from cdpipe.io.out.maps import PointMap, gather_map, join_scalars
 from cdpipe.io.out.scans import Fields, Outgoing
 from cdpipe.mapping.mapping import choose_keyframes
-from cdpipe.model.aligned import alignment_of
+from cdpipe.model.aligned import alignment_of, is_torn
 from cdpipe.model.report import ChangedObject, ChangeReport
 from cdpipe.model.types import ScanSource, SessionName
 
@@ -51,6 +52,12 @@ def gather_answer_map(
     for source, scans in zip(sessions, found.keyframe_scans, strict=True):
         require_own_keyframes(source, scans, found)
     after_T = alignment_of(found, sessions[1].odom_T_sensor)
+    if is_torn(found, sessions[1].odom_T_sensor):
+        text = (
+            f"{sessions[1].name}: its odometry lost its way, so its points in this map lie wrong behind that place: "
+            "tunnelcd view shows them where they were found"
+        )
+        warnings.warn(text, InputWarning, stacklevel=2)
     clouds = []
     for name, source in zip(_SESSIONS, sessions, strict=True):
         cloud = gather_map(Outgoing(source, _fields(found, name)), cell_m, report)

@@ -17,7 +17,7 @@ from cdpipe.io.out.answer_map import require_own_keyframes
 from cdpipe.io.readers import open_session
 from cdpipe.mapping.mapping import choose_keyframes
 from cdpipe.merge.coverage import measure_coverage
-from cdpipe.model.aligned import alignment_of, is_torn, merge_at_scans
+from cdpipe.model.aligned import aligned_scans, alignment_of, is_torn, merge_at_scans
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.report import ChangeReport
 from cdpipe.model.types import PosedScan, ScanSource, WrappedScans
@@ -98,7 +98,7 @@ class _Found(WrappedScans):
 
     def __init__(self, source: ScanSource, report: ChangeReport) -> None:
         super().__init__(source)
-        self._keyframes = np.sort(report.keyframe_scans[1])
+        self._keyframes = aligned_scans(report, len(source.odom_T_sensor))
         self._poses = merge_at_scans(report, self._keyframes) @ source.odom_T_sensor[self._keyframes]
 
     @property

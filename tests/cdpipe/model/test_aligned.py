@@ -7,7 +7,7 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import invert, make_pose, yaw_pose
-from cdpipe.model.aligned import alignment_of
+from cdpipe.model.aligned import alignment_of, is_torn
 from cdpipe.model.report import ChangeRegions, ChangeReport
 
 RIGID = yaw_pose(0.4, (3.0, -2.0, 0.5))
@@ -54,3 +54,19 @@ def test_answers_to_another_pair_are_refused() -> None:
     with pytest.raises(InputError, match=r"the answer's before_T_after|local_before_T_after\[0\] is not a rigid"):
         alignment_of(bad, POSES)
     assert np.isfinite(alignment_of(report(invert(local)), POSES).to_map(np.zeros((1, 3)))).all()
+
+
+@pytest.mark.parametrize("keyframes", [KEYFRAMES, KEYFRAMES[::-1], np.zeros(0, np.int64)])
+@pytest.mark.parametrize(("leap_m", "expected"), [(0.0, False), (0.8, False), (30.0, True)])
+def test_an_answer_tells_where_the_odometry_lost_its_way(keyframes: np.ndarray, leap_m: float, expected: bool) -> None:
+    scans = keyframes if len(keyframes) else np.arange(40)
+    local = np.array([make_pose(translation=(leap_m * (scan >= 20), 0, 0)) @ RIGID for scan in scans])
+    assert is_torn(report(local, keyframes), POSES) is expected
+    assert not is_torn(report(None, keyframes), POSES)
+
+
+def test_drift_between_keyframes_that_lie_far_apart_is_no_loss() -> None:
+    poses = np.array([make_pose(translation=(60.0 * step, 0.0, 1.0)) for step in range(4)])
+    local = np.array([make_pose(translation=(1.2 * step, 0, 0)) for step in range(4)])
+    assert not is_torn(report(local, np.arange(4)), poses)
+    assert not is_torn(report(local[:1], np.arange(1)), poses)

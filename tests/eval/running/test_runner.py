@@ -152,12 +152,16 @@ def test_finished_cells_are_kept(smoke_copy: RunFolder, runner: Runner) -> None:
     assert before == {path: path.stat().st_mtime_ns for path in before}
 
 
-def test_the_summary_counts_a_refused_unchanged_pair_as_an_alarm(smoke_copy: RunFolder) -> None:
-    path = smoke_copy.cell(UNCHANGED, 20000, "paper")
-    cell = json.loads(path.read_text())
-    cell["row"] |= {"status": "merge_refused", "is_alarm": None}
-    path.write_text(json.dumps(cell))
-    assert write_tables(smoke_copy)["is_alarm"].isna().sum() == len(VARIANTS) + 1
+@pytest.mark.parametrize("refusing", [("paper",), VARIANTS])
+def test_the_summary_counts_a_refused_unchanged_pair_as_an_alarm(
+    smoke_copy: RunFolder, refusing: tuple[str, ...]
+) -> None:
+    for variant in refusing:
+        path = smoke_copy.cell(UNCHANGED, 20000, variant)
+        cell = json.loads(path.read_text())
+        cell["row"] |= {"status": "merge_refused", "is_alarm": None}
+        path.write_text(json.dumps(cell))
+    assert write_tables(smoke_copy)["is_alarm"].isna().sum() == len(VARIANTS) + len(refusing)
     summary = pd.read_csv(smoke_copy.path / "summary.csv").set_index(["scenario", "variant", "metric"])
     assert summary.loc[(UNCHANGED, "paper", "is_alarm"), ["value", "n_used"]].tolist() == [1, 1]
 

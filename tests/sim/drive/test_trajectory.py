@@ -246,6 +246,17 @@ def test_sides_are_chosen_together_where_the_nearest_ones_leave_no_room(
     assert (high[:95] == 3.0).all() and high[100] == (1.0 if more else 3.0)
 
 
+def test_the_way_back_passes_on_the_other_side() -> None:
+    wanted, low, high = np.zeros(200), np.full(200, -2.0), np.full(200, 2.0)
+    spans = [
+        (barring(50, 60, -0.3, 1.0), barring(150, 160, -1.0, 0.3)),
+        (barring(50, 60, -3, 0.5), barring(150, 160, -0.5, 3)),
+    ]
+    obstacles = [tuple(np.where(np.isnan(out), back, out) for out, back in zip(*each, strict=True)) for each in spans]
+    assert pass_obstacles(wanted, low, high, obstacles) is None
+    assert (low[50:60] == 1.0).all() and (high[150:160] == -1.0).all()
+
+
 def test_what_bars_the_way_on_every_side_is_named_with_its_place() -> None:
     wanted, low, high = (np.full(200, each) for each in (-2.0, -3.0, 3.0))
     obstacles = (barring(50, 90, -2.5, -1.0), barring(60, 80, -1.5, 3.5), barring(70, 110, -3.5, -2.2))
