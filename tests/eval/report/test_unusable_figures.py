@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,7 +77,8 @@ def test_a_seed_that_is_none_is_refused(tmp_path: Path) -> None:
 def test_a_provenance_and_an_answer_that_hold_anything_kill_no_page(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", PLAIN[:6])
     plan = {"name": ["\ud800"], "report": 1, "targets": 1, "until": "merge"}
-    write_json(folder / "provenance.json", {"tool": "tunnelcd", "plan": plan, "machine": [], "command": {}})
+    document = {"tool": "tunnelcd", "plan": plan, "machine": [], "command": {}}
+    (folder / "provenance.json").write_text(json.dumps(document))  # `write_json` refuses the name
     answer = RunFolder(folder).answer(f"{PLAIN[0]}/one", 1, PLAIN[0])
     write_json(answer / "answer.json", {"config": {"merge": {"min_overlap": "x"}}, "evidence": {"overlap": "x"}})
     write_json(answer.with_name("method_1") / "answer.json", {"config": ["x"], "evidence": 1})
