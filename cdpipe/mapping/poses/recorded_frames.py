@@ -16,14 +16,13 @@ from scipy.spatial import cKDTree
 
 from cdpipe.core.geometry import BoolArray, Float64Array, Int64Array, fit_rigid, invert, transform_each
 from cdpipe.mapping.poses.scan_registration import moved_m
+from cdpipe.model.aligned import LEAP_M
 from cdpipe.model.alignment import PathAlignment
 from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport, SurfaceField
 from cdpipe.model.types import PointMap
 
 # Both sessions were in one place where their paths come this near to one another, as evidence `overlap` has it.
 _SHARED_M = 5.0
-# Most by which odometry errs between two keyframes that has not lost its way: KISS-ICP by 0.7 m in a sharp turn.
-_LEAP_M = 1.0
 
 
 def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) -> ChangeReport:
@@ -71,7 +70,7 @@ def report_as_recorded(report: ChangeReport, before: PointMap, after: PointMap) 
 def _stretches(recorded_T_keyframe: Float64Array, odom_T_keyframe: Float64Array) -> Int64Array:
     """Return which stretch each of (K,) keyframes is in; one ends where the recorded odometry lost its way."""
     recorded, mapped = (invert(each[:-1]) @ each[1:] for each in (recorded_T_keyframe, odom_T_keyframe))
-    return np.append(0, np.cumsum(moved_m(recorded, mapped) > _LEAP_M))
+    return np.append(0, np.cumsum(moved_m(recorded, mapped) > LEAP_M))
 
 
 def _where_they_met(
