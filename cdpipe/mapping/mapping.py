@@ -1,4 +1,4 @@
-"""From scans to a voxel map in one pass, in two where returns of dust were left out; memory grows with the map.
+"""From scans to a voxel map in one pass, in two where the air was dusty; memory grows with the map.
 
 Returns and range images go to a temporary file where they are large: eleven bytes per return, twice that while movers
 are taken out.
@@ -18,12 +18,12 @@ from cdpipe.core.geometry.grid_index import column_keys
 from cdpipe.core.geometry.voxel import FINEST_CELL_M, UniqueCells, cell_corners, cell_keys, require_reachable
 from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.core.spooled import SpooledArray
-from cdpipe.mapping.airborne import ClearScans
+from cdpipe.mapping.airborne import FEW_SCANS, ClearScans, returns_around, returns_of
 from cdpipe.mapping.free_space import COLUMNS, ROWS, render_view
 from cdpipe.mapping.movers import drop_movers
 from cdpipe.mapping.poses.consistency import make_consistent
 from cdpipe.model.config import MapConfig
-from cdpipe.model.types import PLACES, KeyframeViews, PointMap, PosedScan, ScanSource
+from cdpipe.model.types import KeyframeViews, PointMap, PosedScan, ScanSource, offsets_in_cells
 
 _BATCH_SCANS = 64
 _BLOCK_RETURNS = 1 << 22
@@ -46,8 +46,8 @@ def build_map(
     order does not depend on `batch_scans`.
 
     Args:
-        source: The session, read in order: once as it is; before, where poses are made consistent; again, where
-            returns of mist or dust were left out (`ClearScans`).
+        source: The session, read in order: once as it is; before, where poses are made consistent or returns of mist
+            or dust are left out (`ClearScans`); again, where there were many of those.
         config: Voxel size, longest range, keyframe spacing, and what is made consistent and left out.
         batch_scans: Scans held in memory at a time.
         on_step: Told how many scans were registered while poses are made consistent.
@@ -61,12 +61,14 @@ def build_map(
     cleared, consistent = source, None
     if config.consistency != "none":
         source = consistent = make_consistent(source, has_loops=config.consistency == "graph", on_step=on_step)
-    point_map = _accumulate(source, keyframe_scans, config, batch_scans)
-    if isinstance(cleared, ClearScans) and cleared.has_dropped:
-        supported = cleared.supported_by(point_map)
-        del point_map  # a second one is made
+    if isinstance(cleared, ClearScans) and len(dusty := cleared.find_dusty()):
+        if len(dusty) <= FEW_SCANS * len(source.odom_T_sensor):
+            returns = returns_around(cleared, dusty, source, config)
+        else:
+            returns = returns_of(_accumulate(source, keyframe_scans, config, batch_scans))
+        supported = cleared.supported_by(returns, source.odom_T_sensor)
         source = supported if consistent is None else consistent.over(supported)
-        point_map = _accumulate(source, keyframe_scans, config, batch_scans)
+    point_map = _accumulate(source, keyframe_scans, config, batch_scans)
     point_map = replace(point_map, recorded_T_sensor=recorded_T_sensor)
     return drop_movers(point_map) if config.movers == "drop" else point_map
 
@@ -132,11 +134,7 @@ class _MapAccumulator:
         self._n_returns.append(len(near))
         if scan.index in self._keyframe_scans:
             self._views.append(render_view(scan.points_sensor, scan.airborne_sensor))
-        in_cells = points / voxel_m
-        in_cells -= np.floor(in_cells)
-        in_cells *= PLACES
-        # just below a border the fraction rounds to 1
-        self._return_offsets.append(np.minimum(in_cells, PLACES - 1, out=in_cells).astype(np.uint8))
+        self._return_offsets.append(offsets_in_cells(points, voxel_m))
         weights = 1 / squared_m2
         terms = np.empty((6, len(near)))
         np.multiply(points.T, weights, out=terms[:3])

@@ -122,6 +122,27 @@ class WrappedScans(ScanSource):
         return self._source.scans()
 
 
+def offsets_in_cells(points: Float64Array, voxel_m: float) -> UInt8Array:
+    """Return the (N, 3) positions of (N, 3) points in their cells of a map, in 1/PLACES of `voxel_m`, rounded down."""
+    in_cells = points / voxel_m
+    in_cells -= np.floor(in_cells)
+    in_cells *= PLACES
+    # just below a border the fraction rounds to 1
+    return np.minimum(in_cells, PLACES - 1, out=in_cells).astype(np.uint8)
+
+
+def as_stored(points: Float64Array, voxel_m: float) -> Float64Array:
+    """Return the (N, 3) positions that a map of such cells tells of (N, 3) returns (`PointMap.positions_of`)."""
+    return _positions(points / voxel_m, offsets_in_cells(points, voxel_m), voxel_m)
+
+
+def _positions(in_voxels: Float64Array, offsets: UInt8Array, voxel_m: float) -> Float64Array:
+    np.floor(in_voxels, out=in_voxels)
+    in_voxels += (offsets + 0.5) / PLACES
+    in_voxels *= voxel_m
+    return in_voxels
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeViews:
     """Range image of each keyframe: the space in front of the measured ranges is free.
@@ -207,12 +228,9 @@ class PointMap:
         """
         if self.return_offsets is None:
             raise ValueError("return_offsets is None: this map does not store the positions of its returns")
-        positions = self.points.take(self.return_points[returns], axis=0)
-        positions /= self.voxel_m
-        np.floor(positions, out=positions)
-        positions += (self.return_offsets[returns] + 0.5) / PLACES
-        positions *= self.voxel_m
-        return positions
+        in_voxels = self.points.take(self.return_points[returns], axis=0)
+        in_voxels /= self.voxel_m
+        return _positions(in_voxels, self.return_offsets[returns], self.voxel_m)
 
     def scans_of(self, returns: Int64Array) -> Int64Array:
         """Return the (N,) scan of each of (N,) returns."""

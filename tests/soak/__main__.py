@@ -25,6 +25,7 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, required=True, help="new or empty folder")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seeds", type=int, default=4, help="seeds of the plan, eight cells each")
+    parser.add_argument("--only", action="append", default=[], metavar="ROW", help="of the table; may be repeated")
     options = parser.parse_args()
     fix_threads()
     os.environ["PYTHONPATH"] = str(Path(__file__).parents[2])
@@ -35,7 +36,7 @@ if __name__ == "__main__":
 
     soak = Soak(options.out, random.Random(options.seed), Size(n_seeds=options.seeds))
     soak.run_undisturbed()
-    every = [*RUNS, *COMMANDS, *disks()]
+    every = [name for name in (*RUNS, *COMMANDS, *disks()) if not options.only or name in options.only]
     for number, name in enumerate(itertools.cycle(every)):
         if soak.seconds() > 60 * options.minutes:
             break

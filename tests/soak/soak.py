@@ -132,9 +132,10 @@ COMMANDS: Mapping[str, Written] = {
     "merge-runs": Written("merge-runs a b --out union", "union", {"a": "run/run", "b": "run/run"}, is_once=True),
     # the tables beside the answers hold times
     "evaluate": Written(
-        f"evaluate --plan given/plan.yaml --command {shlex.quote(_METHOD)} --merge given --as mine --out bench",
+        f"evaluate --plan given/plan.yaml --command {shlex.quote(_METHOD)} --merge given --as mine --reference run "
+        "--out bench",
         "bench/answers",
-        {"given": "given"},
+        {"given": "given", "run": "run/run"},
     ),
     "submit": Written("submit bench --out zip/mine.zip", "zip", {"bench": "evaluate/bench"}),
     "leaderboard": Written("leaderboard zip/mine.zip --out board/index.html", "board", {"zip": "submit/zip"}),

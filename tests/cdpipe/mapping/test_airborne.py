@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 
@@ -13,12 +14,13 @@ import cdpipe
 from cdpipe.core.geometry import Float64Array, Int32Array
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import read_session
-from cdpipe.mapping import airborne
-from cdpipe.mapping.airborne import ClearScans, LiesOnSurface, clear_air, drop_airborne
+from cdpipe.mapping import airborne, mapping
+from cdpipe.mapping.airborne import ClearScans, LiesOnSurface, clear_air, drop_airborne, returns_of
+from cdpipe.mapping.counted import CountedScans
 from cdpipe.mapping.free_space import PIXEL_HEIGHT_RAD, free_space_votes, is_veiled, render_view
 from cdpipe.mapping.mapping import build_map
 from cdpipe.model.config import MapConfig, load_config
-from cdpipe.model.types import KeyframeViews, PosedScan, WrappedScans
+from cdpipe.model.types import KeyframeViews, PointMap, PosedScan, WrappedScans
 from scenarios import load_scenario
 from sim.sensor.air import AIR
 from sim.session.simulate import simulate_pair
@@ -132,6 +134,10 @@ class Held(WrappedScans):
     def __init__(self, held: PosedScan) -> None:
         self._held = held
 
+    @property
+    def odom_T_sensor(self) -> Float64Array:
+        return self._held.odom_T_sensor[None]
+
     def scan(self, index: int) -> PosedScan:
         return self._held
 
@@ -150,7 +156,7 @@ def test_a_scan_of_clear_air_is_examined_once_and_a_dusty_one_again(
     monkeypatch.setattr(airborne, "drop_airborne", examine)
     cleared = ClearScans(Held(scan))
     scans = [cleared.scan(0) for _ in range(2)]
-    assert len(examined) == (2 if is_dusty else 1) and cleared.has_dropped == is_dusty
+    assert len(examined) == (2 if is_dusty else 1) and cleared.find_dusty().tolist() == [0] * is_dusty
     assert [len(each.pixels) for each in scans] == 2 * [len(drop_airborne(scan).pixels)]
 
 
@@ -257,12 +263,67 @@ def test_dark_returns_come_back_from_a_surface_and_from_nowhere_else() -> None:
     cleared = ClearScans(Held(dark))
     assert len(near) > 500 and not np.isin(cleared.scan(3).pixels, scan.pixels[near]).any()
     for every in (1, 5):  # 0.28 of them come back to the sparse map if a cell must hold three returns
-        back = np.isin(scan.pixels, cleared.supported_by(Sparse(every).mapped()).scan(3).pixels)
+        back = np.isin(scan.pixels, supported_by_map(cleared, Sparse(every).mapped()).scan(3).pixels)
         assert back[on].mean() > 0.95 and not back[before_it].any()
     # a lone return is no surface
     lone = Sparse(211).mapped()
     assert len(lone.return_pixels) > 1000
-    assert not np.isin(scan.pixels, cleared.supported_by(lone).scan(3).pixels)[near].any()
+    assert not np.isin(scan.pixels, supported_by_map(cleared, lone).scan(3).pixels)[near].any()
+
+
+def supported_by_map(cleared: ClearScans, point_map: PointMap) -> ClearScans:
+    return cleared.supported_by(returns_of(point_map), point_map.odom_T_sensor)
+
+
+class Dimmed(WrappedScans):
+    """A session of clear air in which some scans have dark returns: on the surfaces, and in front of them."""
+
+    dark = (10, 11, 30)
+
+    def scan(self, index: int) -> PosedScan:
+        return self._dimmed(super().scan(index))
+
+    def scans(self) -> Iterator[PosedScan]:
+        return map(self._dimmed, super().scans())
+
+    def _dimmed(self, scan: PosedScan) -> PosedScan:
+        if scan.index not in self.dark:
+            return scan
+        assert scan.signal is not None
+        points, signal = scan.points_sensor.copy(), scan.signal.copy()
+        near = np.flatnonzero(np.linalg.norm(points, axis=1) < 2.9)[::7]
+        signal[near] = 5
+        points[near[1::2]] *= 0.85
+        return replace(scan, points_sensor=points, signal=signal)
+
+
+@pytest.mark.parametrize("consistency", ["none", "scan-to-map"])
+def test_the_map_of_few_dusty_scans_is_made_once_and_equals_that_of_two_passes(
+    consistency: str, pair: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = MapConfig.model_validate({"airborne": "drop", "consistency": consistency})
+    passes: list[str] = []
+
+    def mapped() -> PointMap:
+        passes.clear()
+        counted = CountedScans(Dimmed(open_session(pair / "before")), lambda step, *_: passes.append(step))
+        return build_map(ClearScans(counted), config)
+
+    once, n_once = mapped(), len(set(passes))
+    monkeypatch.setattr(mapping, "FEW_SCANS", 0.0)
+    twice, n_twice = mapped(), len(set(passes))
+    assert n_twice == n_once + 1
+    for field in fields(once):
+        one, other = getattr(once, field.name), getattr(twice, field.name)
+        if field.name == "views":
+            one, other = one.ranges_m, other.ranges_m
+        assert np.array_equal(one, other), field.name
+    # returns of the surfaces came back, those in front of them did not
+    recorded = Dimmed(open_session(pair / "before"))
+    for index in Dimmed.dark:
+        kept = once.return_pixels[once.scan_offsets[index] : once.scan_offsets[index + 1]]
+        near = recorded.scan(index).signal == 5
+        assert 0.3 < np.isin(recorded.scan(index).pixels[near], kept).mean() < 0.7
 
 
 class ClearedOnce(WrappedScans):
