@@ -228,8 +228,11 @@ def _format_mistake(document: Document, key: Key, rule: str) -> str:
         if not is_there:
             return visible(f"{document.where(key)}: {join_key(key)}: {rule}")
         value = value[part]
-    text = repr(value)
-    return visible(f"{document.where(key)}: {join_key(key)} = {text if len(text) <= 60 else text[:57] + '...'}: {rule}")
+    return visible(f"{document.where(key)}: {join_key(key)} = {_brief(repr(value))}: {rule}")
+
+
+def _brief(text: str, most: int = 60) -> str:
+    return text if len(text) <= most else text[: most - 3] + "..."
 
 
 def _key_of(line: str) -> str:
@@ -283,14 +286,22 @@ def _path_of(name_or_path: str) -> Path:
     if name_or_path in files:
         return _shorten(files[name_or_path])
     path = Path(name_or_path)
-    if path.is_file():
+    if _is_file(path):
         return path
     if path.suffix in SUFFIXES:
         raise ScenarioError(
-            f"{visible(str(path))}: no such file; a scenario is a YAML file or a name such as {min(files)}"
+            f"{visible(_brief(str(path), 300))}: no such file; a scenario is a YAML file or a name such as {min(files)}"
         )
     hint = suggest(name_or_path, files) or "; `tunnelcd list scenarios` names all"
-    raise ScenarioError(f'scenario "{visible(name_or_path)}": unknown{hint}')
+    raise ScenarioError(f'scenario "{visible(_brief(name_or_path))}": unknown{hint}')
+
+
+def _is_file(path: Path) -> bool:
+    """Tell whether there is such a file; there is none of a name that no file system takes."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
 
 
 def _shorten(path: Path) -> Path:
@@ -321,11 +332,11 @@ def _base_path(name: Any, path: Path, where: str, children: tuple[Path, ...]) ->
         raise ScenarioError(f"{where}: extends = {name!r}: expected the name of a scenario or a YAML file")
     try:
         beside = path.parent / name
-        base = beside if Path(name).suffix in SUFFIXES and beside.is_file() else _path_of(name)
+        base = beside if Path(name).suffix in SUFFIXES and _is_file(beside) else _path_of(name)
     except ScenarioError as error:
-        raise ScenarioError(f"{where}: extends = {name!r}: {error}") from error
+        raise ScenarioError(f"{where}: extends = {_brief(repr(name))}: {error}") from error
     if base.resolve() in [child.resolve() for child in (*children, path)]:
-        raise ScenarioError(f"{where}: extends = {name!r}: the files extend each other in a circle")
+        raise ScenarioError(f"{where}: extends = {_brief(repr(name))}: the files extend each other in a circle")
     return base
 
 

@@ -604,3 +604,11 @@ def test_room_is_needed_in_the_drifts_that_are_driven(tmp_path: Path) -> None:
     (tmp_path / "drive.tum").write_text("0 1 0 1 0 0 0 1\n9 9 0 1 0 0 0 1\n")
     recorded = "".join(f"{name}: {{trajectory: drive.tum}}\n" for name in ("before", "after"))
     check_scenario(written(tmp_path, text.split("props:")[0].replace("{uniform: [3, 4]}", "0.9") + recorded))
+
+
+@pytest.mark.parametrize("name", ["9" * 5000, f"{'9' * 5000}.yaml"])
+def test_a_base_with_a_name_that_no_file_can_have_is_told_on_one_short_line(name: str, tmp_path: Path) -> None:
+    path = written(tmp_path, f'extends: "{name}"\n')
+    with pytest.raises(ScenarioError, match=r"extends = ['\"]9+\.\.\.: .*9+\.\.\.") as error:
+        load_scenario(path, 1)
+    assert len(str(error.value)) < 600 + len(path) and "\n" not in str(error.value)

@@ -10,7 +10,7 @@ import numpy as np
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, Int32Array, transform, travelled_m
-from cdpipe.core.geometry.voxel import require_reachable, thin
+from cdpipe.core.geometry.voxel import FINEST_CELL_M, max_coordinate_m, require_reachable, thin
 from cdpipe.core.progress import Progress
 from cdpipe.io.answer import Answer, read_answer
 from cdpipe.io.out.answer_map import require_own_keyframes
@@ -69,7 +69,21 @@ def read_content(
         raise InputError(f"{folder}: the method gave no answer ({why}): view the sessions one by one")
     first, second = (open_session(each) if isinstance(each, Path) else each for each in (before, after))
     sessions = first, second
-    return gather_content(sessions, answer.method, locate_objects(answer, sessions), on_stage)
+    report = locate_objects(answer, sessions)
+    _require_shown(folder, report)
+    return gather_content(sessions, answer.method, report, on_stage)
+
+
+def _require_shown(folder: Path, report: ChangeReport) -> None:
+    """Require that the places of an answer can be thinned to the finest cells of its page."""
+    told = {f"objects[{index}]": item.points_map for index, item in enumerate(report.objects)}
+    if report.surface is not None:
+        told["surface_points"] = report.surface.points_map
+    for name, points in told.items():
+        farthest_m = float(np.abs(points).max(initial=0.0))
+        if not farthest_m < (most_m := max_coordinate_m(FINEST_CELL_M)):
+            where = f"{folder}: {name} reaches {farthest_m:.0f} m from the origin"
+            raise InputError(f"{where}: expected places in the sessions' odom frames, within {most_m:.0f} m")
 
 
 def gather_content(

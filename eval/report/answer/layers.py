@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cdpipe.core.geometry import Float64Array, Int64Array
-from cdpipe.core.geometry.voxel import thin
+from cdpipe.core.geometry.voxel import FINEST_CELL_M, thin
 from cdpipe.model.report import SurfaceField
 from eval.report.answer.content import AnswerContent, near_stretches
 from eval.report.answer.shapes import AFTER_RGB, BEFORE_RGB, REGION_RGB, WRONG_RGB, roof_mask, sphere_path
@@ -21,7 +21,7 @@ _LINE_M, OBJECT_POINT_M, _ROCK_POINT_M = 0.05, 0.09, 0.12
 # Edge of a point of a map, as a share of the cell that holds one.
 _FILLED = 0.8
 # Cell of the points of objects and of rock; that of rock grows until no more points are left.
-_OBJECT_CELL_M, _ROCK_CELL_M, _LARGER, _MAX_ROCK = 0.03, 0.1, 1.25, 50_000
+_OBJECT_CELL_M, _ROCK_CELL_M, _LARGER, _MAX_ROCK = FINEST_CELL_M, 0.1, 1.25, 50_000
 _LARGEST, _MAX_PATH = 65_535, 20_000
 MOVED_ROCK, ELSEWHERE = "rock that moved", "displacement elsewhere"
 

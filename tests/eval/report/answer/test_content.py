@@ -11,7 +11,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import invert, make_pose, transform
 from cdpipe.io.answer import write_answer, write_failure
 from cdpipe.io.readers import open_session
-from cdpipe.model.report import ChangedObject
+from cdpipe.model.report import ChangedObject, SurfaceField
 from cdpipe.model.types import PosedScan, WrappedScans
 from eval.report.answer.content import MAX_POINTS, _thin_session, gather_content, near_stretches, read_content
 from tests.cdpipe.model.test_sentence import EMPTY
@@ -108,6 +108,19 @@ def test_what_is_no_answer_to_the_pair_is_refused(tiny_pair: Path, tmp_path: Pat
         read(tiny_pair, tmp_path / "other")
     with pytest.raises(InputError, match="no such file or folder"):
         read_content(tiny_pair / "absent", tiny_pair / "after", tmp_path / "other", lambda *_: None)
+
+
+@pytest.mark.parametrize("name", [r"objects\[0\]", "surface_points"])
+def test_places_that_no_page_can_show_are_refused(
+    name: str, tiny_pair: Path, tiny_merge: np.ndarray, tmp_path: Path
+) -> None:
+    far = np.array([[0.0, 0.0, 2e5]])
+    item = ChangedObject("after", "added", -1, np.array([[3, 10]], dtype=np.int32), far, 1.0)
+    rock = SurfaceField(far, np.array([[0.0, 0.0, 1.0]]), np.ones(1), np.ones(1), np.full(1, -1, dtype=np.int32))
+    what = {"objects": (item,)} if name.startswith("objects") else {"surface": rock}
+    write_answer(tmp_path / "answer", "mine", replace(EMPTY, before_T_after=tiny_merge, **what))
+    with pytest.raises(InputError, match=rf"answer: {name} reaches 200000 m from the origin: expected .* 52429 m$"):
+        read(tiny_pair, tmp_path / "answer")
 
 
 @pytest.mark.parametrize(
