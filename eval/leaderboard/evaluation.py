@@ -48,7 +48,7 @@ from eval.running.export import copy_pair
 from eval.running.pair_run import TOOLS, Pair, Tools, is_pair_dropped, pair_lock, score_unmade
 from eval.running.predictions import list_predicted, require_current_scores, require_free_name
 from eval.running.runfolder import RunFolder, write_json, write_tables
-from eval.running.runner import list_plan_pairs, open_pair, start_provenance
+from eval.running.runner import is_simulated, list_plan_pairs, open_pair, start_provenance
 from eval.running.stages.pair_stages import PairStages
 from eval.scoring.scoring import METRICS_VERSION, CaseScore, score_stored
 from eval.truth.ground_truth import GroundTruth
@@ -242,9 +242,14 @@ def _is_finished(run: RunFolder, method: Method, pair: Pair, called: str) -> boo
 
 
 def _is_about(run: RunFolder, pair: Pair, call: CallFile) -> bool:
-    """Tell whether a call was about the present simulation of a pair; of removed sessions their record tells."""
-    is_kept = bool(call.pair_digest) and is_pair_dropped(run, pair) is True
-    return is_kept or call.pair_digest == digest_pair(run.pair(pair.name, pair.seed))
+    """Tell whether a call was about the present world of a pair, as its sessions or the record of removed ones tell.
+
+    A pair that could not be made is one where its seed draws nothing for the same reason; a drawn one is tried again.
+    """
+    if not call.pair_digest:
+        return pair.scenario is None and call.error == pair.error
+    held = run.pair(pair.name, pair.seed)
+    return is_pair_dropped(run, pair) is True or (call.pair_digest == digest_pair(held) and is_simulated(held, pair))
 
 
 def _evaluate_pair(run: RunFolder, method: Method, pair: Pair, called: str, progress: RunProgress, tools: Tools) -> str:

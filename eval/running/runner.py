@@ -182,7 +182,7 @@ def open_pair(
     run: RunFolder, pair: Pair, progress: RunProgress, tools: Tools = TOOLS
 ) -> tuple[PairStages, GroundTruth] | str:
     """Simulate a pair unless it exists and open it; a text says why it cannot be made. The caller holds its lock."""
-    if not _is_simulated(run.pair(pair.name, pair.seed), pair):
+    if not is_simulated(run.pair(pair.name, pair.seed), pair):
         _remove_pair(run, pair)
     return PairRun(run, pair, Made(None), progress, tools).open()
 
@@ -272,7 +272,7 @@ def _remove_stale(run: RunFolder, pair: Pair, force: bool) -> None:
     """Remove what is about to run again, so that no table holds it if the run is interrupted."""
     if not pair.todo:
         return
-    if force or not (_is_simulated(run.pair(pair.name, pair.seed), pair) or is_pair_dropped(run, pair)):
+    if force or not (is_simulated(run.pair(pair.name, pair.seed), pair) or is_pair_dropped(run, pair)):
         _remove_pair(run, pair)
         remove(dropped_file(run, pair.name, pair.seed))
     for each in pair.todo:
@@ -330,7 +330,7 @@ def _lacks_sessions(run: RunFolder, pair: Pair) -> bool:
     return not (pair.todo or is_there)
 
 
-def _is_simulated(path: Path, pair: Pair) -> bool:
+def is_simulated(path: Path, pair: Pair) -> bool:
     """Tell whether the pair exists, is complete, and was made from this scenario and the present files."""
     return _compare_world(path, pair) is True
 

@@ -390,6 +390,39 @@ def test_rows_about_another_world_go_with_its_pair(evaluator: Evaluator) -> None
     assert len(rows_of(evaluator)) == 2
 
 
+def test_a_pair_whose_scenario_was_edited_is_asked_anew(evaluator: Evaluator) -> None:
+    evaluator.evaluate()
+    edited = load_scenario(ONE_BOX, 20000).model_copy(update={"description": "another world"})
+
+    def draw(name: str, seed: int, settings: tuple[str, ...] = ()) -> Scenario:
+        return edited if name == ONE_BOX else load_scenario(name, seed, settings)
+
+    assert [evaluator.evaluate(tools=replace(TOOLS, draw=draw)).n_done for _ in range(2)] == [1, 0]
+    assert read_pair_truth(evaluator.run.pair(ONE_BOX, 20000)).scenario == edited.model_dump(mode="json")
+    assert len(rows_of(evaluator)) == 2
+
+
+def test_a_pair_that_cannot_be_made_any_more_or_can_by_now_is_asked_anew(evaluator: Evaluator) -> None:
+    reasons = {ONE_BOX: "does not fit"}
+
+    def draw(name: str, seed: int, settings: tuple[str, ...] = ()) -> Scenario:
+        if name in reasons:
+            raise ScenarioError(reasons[name])
+        return load_scenario(name, seed, settings)
+
+    tools = replace(TOOLS, draw=draw)
+    evaluator.evaluate()
+    for n_done in (1, 0):
+        outcome = evaluator.evaluate(tools=tools)
+        assert (outcome.n_done, outcome.n_failed) == (n_done, 1)
+    reasons[ONE_BOX] = "is too small"
+    assert evaluator.evaluate(tools=tools).n_done == 1
+    assert rows_of(evaluator).set_index("scenario").loc[ONE_BOX, "error"] == "is too small"
+    reasons.clear()
+    outcome = evaluator.evaluate(tools=tools)
+    assert (outcome.n_done, outcome.n_failed) == (1, 0)
+
+
 def test_pairs_whose_sessions_were_removed_are_not_asked_again(evaluator: Evaluator) -> None:
     evaluator.evaluate()
     drop_pair(evaluator.run, ONE_BOX, 20000, "answers")
