@@ -49,7 +49,7 @@ from eval.plans.targets import read_targets
 from eval.plans.worlds import world_slug
 from eval.running.cell_rows import ITEM_TABLES, SURFACE_TABLES, collect_tables, holds_rows
 from eval.running.results.tables import without_unusable
-from eval.tables.alarms import count_alarms
+from eval.tables.alarms import with_counted_alarms
 from eval.tables.effects import effects
 from eval.tables.hardness import FILES as HARD_FILES
 from eval.tables.hardness import breaking_points, hardness_table
@@ -212,10 +212,11 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     results, items = collected["results"], {table: collected[table] for table in ITEM_TABLES}
     usable = {table: without_unusable(frame) for table, frame in collected.items()}
     usable["results"] = without_costs_of_failures(usable["results"])
+    counted = with_counted_alarms(usable["results"], run.stored_provenance().get("plan"))
     tables = {
-        "summary": summarise(_with_counted_alarms(run, usable["results"]), keyframes=usable["keyframes"]),
+        "summary": summarise(counted, keyframes=usable["keyframes"]),
         **{table: collected[table] for table in SURFACE_TABLES},
-        "effects": effects(usable["results"]),
+        "effects": effects(counted),
         "merge": merge_table(usable["results"], read_targets(run.stored_provenance())),
         **_report_tables(run, usable["results"], usable),
     }
@@ -236,14 +237,6 @@ def write_tables(run: RunFolder) -> pd.DataFrame:
     finally:
         remove(hidden)
     return results
-
-
-def _with_counted_alarms(run: RunFolder, results: pd.DataFrame) -> pd.DataFrame:
-    plan = run.stored_provenance().get("plan")
-    ends_at_merge = isinstance(plan, Mapping) and plan.get("until") == "merge"
-    if "is_alarm" not in results or ends_at_merge:
-        return results
-    return results.assign(is_alarm=count_alarms(results))
 
 
 def current_results(run: RunFolder, earlier: Mapping[str, Any], now: Mapping[str, Any]) -> pd.DataFrame | None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import pandas as pd
 
@@ -32,3 +35,11 @@ def count_alarms(results: pd.DataFrame) -> Float64Array:
     is_unanswered = (results["status"] != "ok").to_numpy(dtype=np.bool_) & ~may_be_refused(results)
     cries = is_unanswered | (numbers(results, "n_objects") > 0)
     return np.where(is_unchanged_pair(results) & cries, 1.0, alarms)
+
+
+def with_counted_alarms(results: pd.DataFrame, plan: Any) -> pd.DataFrame:
+    """Return results.csv with `is_alarm` as it counts in tables of means; as it is where the plan ends at the merge."""
+    ends_at_merge = isinstance(plan, Mapping) and plan.get("until") == "merge"
+    if "is_alarm" not in results or ends_at_merge:
+        return results
+    return results.assign(is_alarm=count_alarms(results))

@@ -166,6 +166,17 @@ def test_the_summary_counts_a_refused_unchanged_pair_as_an_alarm(
     assert summary.loc[(UNCHANGED, "paper", "is_alarm"), ["value", "n_used"]].tolist() == [1, 1]
 
 
+def test_effects_count_a_refused_unchanged_pair_as_the_summary_does(smoke_copy: RunFolder) -> None:
+    quiet = f"{UNCHANGED}[sensor.range_noise=false]"
+    cell = json.loads(smoke_copy.cell(UNCHANGED, 20000, "tunnelcd").read_text())
+    assert cell["row"]["is_alarm"] is False
+    row = {**cell["row"], "scenario": quiet, "status": "merge_refused", "is_alarm": None}
+    write_json(smoke_copy.cell(quiet, 20000, "tunnelcd"), {**cell, "row": row})
+    write_tables(smoke_copy)
+    alarms = table(smoke_copy, "effects").set_index("metric").loc["is_alarm"]
+    assert alarms[["without", "with", "difference", "n"]].tolist() == [0, 1, 1, 1]
+
+
 def test_a_run_that_makes_no_cell_leaves_who_made_them(smoke_copy: RunFolder, runner: Runner) -> None:
     """Other code, command and time: the provenance still names those that the rows are of; the tables are written."""
     before = smoke_copy.provenance()
