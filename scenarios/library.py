@@ -215,8 +215,12 @@ def _drop_inherited(lines: list[str]) -> list[str]:
 
 
 def _drop_repeated(lines: list[str], broken: set[Key], told: list[Mistake]) -> list[str]:
-    """Drop the schema's mistakes about values that could not be drawn, and those already reported with their line."""
-    names = [f": {join_key(key)} = " for key in broken] + [rule.partition(";")[0] for _, rule in told]
+    """Drop the schema's mistakes about values that could not be drawn, and those already reported with their line.
+
+    Such a value is none to the rules of what holds it, which may ask for it.
+    """
+    untold = {*broken, *(key[:-1] for key in broken)} - {()}
+    names = [f": {join_key(key)} = " for key in untold] + [rule.partition(";")[0] for _, rule in told]
     return [line for line in lines if not any(name in line for name in names)]
 
 

@@ -142,6 +142,21 @@ def test_a_misspelt_section_is_one_mistake_and_its_consequences_are_none(tmp_pat
     assert f'unknown key; did you mean "{name.strip(" :")}"?' in line
 
 
+@pytest.mark.parametrize(
+    ("value", "typo", "told"),
+    [
+        ("0.7}\n", "{unifrom: [0.4, 0.6]}}\n", ".to.fraction"),
+        ("{between: [b, c], fraction: 0.7}", "{choise: [{between: [b, c], fraction: 0.7}]}", ".to"),
+    ],
+)
+def test_a_value_that_cannot_be_drawn_is_one_mistake_where_another_rule_asks_for_it(
+    tmp_path: Path, value: str, typo: str, told: str
+) -> None:
+    assert WORLD.count(value) == 1
+    (line,) = mistakes_of(written(tmp_path, WORLD.replace(value, typo)))
+    assert f": props.2{told} = " in line and "did you mean" in line
+
+
 def test_frozen_leaves_the_world_as_the_before_session_saw_it(tmp_path: Path) -> None:
     path = written(tmp_path, WORLD)
     plain, frozen = load_scenario(path, 1), load_scenario(path, 1, ["frozen=true"])
