@@ -113,6 +113,7 @@ def graft(
         raise InputError("--root: it holds the files of a public recording: name that with --recording")
     public = {} if recording is None else locate_recording(recording, root)
     paths = [*(recordings or []), *(Path(name) for name in public.get("sessions", ()))]
+    _refuse_contradictions(len(paths), split, before_T_after, clearance_m, reach_m)
     told = tell_recordings(paths, form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin)
     for name in ("format", "topics", *(() if trajectory else ("odometry",))):
         told[name] = told[name] or public.get(name, told[name])  # what is said on the command line holds
@@ -123,6 +124,23 @@ def graft(
         make_pair(drawn, seed, out, progress.stage)
     if not quiet:
         echo(f"{out}: before, after, truth; {objects} grafted, seed {seed}", *tell_pair(read_pair_truth(out)))
+
+
+def _refuse_contradictions(
+    n_recordings: int, split: str, before_T_after: Path | None, clearance_m: float, reach_m: float
+) -> None:
+    """Refuse what `scenarios.grafted.Recording` refuses by its keys, by the names of the options."""
+    from cdpipe.core.errors import InputError
+
+    if split != "auto" and n_recordings == 2:
+        raise InputError(f"--split {split}: splits one recording, and there are 2: leave it out")
+    if before_T_after is not None and n_recordings == 1:
+        raise InputError(
+            f"--before-T-after {before_T_after}: merges two recordings, and there is 1, whose parts are in one frame: "
+            "leave it out"
+        )
+    if reach_m <= clearance_m:
+        raise InputError(f"--reach {reach_m:g}: expected more than --clearance, {clearance_m:g}: props stand between")
 
 
 def survey(
