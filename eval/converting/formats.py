@@ -78,6 +78,12 @@ FORMATS = {
 DEFAULT_FOLDER = "pcd"
 
 
+def endings_of_recordings() -> list[str]:
+    """Return the endings of the formats in which recordings leave that are no session of ours."""
+    open_to_all = (each for each in FORMATS.values() if each.write is not None and not each.is_ours_alone)
+    return [suffix for each in open_to_all for suffix in each.suffixes]
+
+
 def choose_format(out: Path, name: str | None) -> str:
     """Return the name in `FORMATS` of what to write: the one that is named, else that of the ending.
 

@@ -11,8 +11,6 @@ from cdpipe.model.types import ScanSource
 from eval.converting.truth import truth_fields
 from eval.core.terminal.progress import RunProgress
 
-ONLY_OURS = "only a recording of an Ouster, once it is a session folder, and a session of ours can become that"
-
 
 @dataclass(frozen=True, slots=True)
 class Request:
@@ -43,5 +41,5 @@ class Request:
             InputError: It is a recording of another format.
         """
         if self.session is None:
-            raise InputError(f"{self.source.name}: {ONLY_OURS}")
+            raise InputError(f"{self.source.name}: no session folder: name one, or a format for recordings")
         return self.session

@@ -105,7 +105,7 @@ def convert(
         (name,) = guess_formats([source], hows)
         _refuse_truth(source, with_truth)
         if out.suffix or to is not None:
-            _refuse_whole_map(source, name, out, to)
+            _refuse_format(source, name, out, to)
             say(quiet, _export(source, out, to, hows[0], progress, cell_m, with_truth=False))
         else:
             say(quiet, _import(source, out, name, hows[0], progress))
@@ -128,14 +128,25 @@ def _refuse_truth(source: Path, with_truth: bool) -> None:
         raise InputError(f"{source}: a recording has no truth: leave --with-truth out")
 
 
-def _refuse_whole_map(source: Path, name: str, out: Path, to: str | None) -> None:
-    """Raise `InputError` if a single file of a format that holds scans one a file is to become more than a map."""
+def _refuse_format(source: Path, name: str, out: Path, to: str | None) -> None:
+    """Raise `InputError` if a recording holds too little for the format that is asked for.
+
+    Sessions of ours alone become some; and a single file of a format that holds scans one a file becomes a map alone.
+    """
     from cdpipe.core.errors import InputError
     from cdpipe.io.foreign.sniff import FORMATS as RECORDINGS
-    from eval.converting.formats import FORMATS, choose_format
+    from cdpipe.io.foreign.sniff import OUSTER
+    from eval.converting.formats import FORMATS, choose_format, endings_of_recordings
 
-    if RECORDINGS[name].in_folders and not source.is_dir() and not FORMATS[choose_format(out, to)].is_map:
+    form = FORMATS[choose_format(out, to)]
+    if RECORDINGS[name].in_folders and not source.is_dir() and not form.is_map:
         raise InputError(f"{source}: a map without its scans has no poses or times: name a new .laz or .ply")
+    if form.is_ours_alone and name in OUSTER:
+        way = f"make one of it first, `tunnelcd convert {source} FOLDER`"
+        raise InputError(f"{source}: only a session folder becomes {form.about}: {way}")
+    if form.is_ours_alone:
+        way = f"name a new file that ends in {', '.join(endings_of_recordings())}"
+        raise InputError(f"{source}: {form.about} needs the columns of an Ouster, and these are bare points: {way}")
 
 
 def _refuse_world(source: Path, seed: int | None, settings: Sequence[str]) -> None:
@@ -232,17 +243,13 @@ def _export(
     with_truth: bool,
 ) -> str:
     """Write a session, or a recording that is read as `how` says, in another format."""
-    from cdpipe.core.errors import InputError
     from cdpipe.io.readers import open_session
     from cdpipe.io.session import read_session
-    from eval.converting.formats import FORMATS, choose_format
-    from eval.converting.request import ONLY_OURS, Request
+    from eval.converting.formats import choose_format
+    from eval.converting.request import Request
     from eval.converting.writing import write_session
 
-    name = choose_format(out, to)
-    if how is not None and FORMATS[name].is_ours_alone:
-        raise InputError(f"{source}: {ONLY_OURS}")
     opened = open_session(source, how, progress.stage)
     session = read_session(source) if how is None else None
     request = Request(opened, session, progress, with_truth, cell_m)
-    return write_session(request, out, name)
+    return write_session(request, out, choose_format(out, to))

@@ -162,7 +162,10 @@ def test_names_and_options_that_do_not_go_together(pair: Path, tmp_path: Path, c
         ((there, tmp_path / "b", "--topic", "/x"), "--topic: "),
         (("smoke/one_box", tmp_path / "w.glb", "--world", "sensor.mod=1"), "--world: sensor.mod = 1: unknown key"),
         (("smoke/one_box", tmp_path / "w.glb", "--with-truth"), "leave --with-truth out"),
-        ((there, tmp_path / "b.osf"), "only a recording of an Ouster, once it is a session folder, and a session of"),
+        (
+            (there, tmp_path / "b.osf"),
+            f"only a session folder becomes Ouster OSF: make one of it first, `tunnelcd convert {there}",
+        ),
         ((before, pair / "after", there, tmp_path / "m.mcap"), "an answer becomes a map with scalar fields: name"),
         ((there, tmp_path, "--odometry", "kiss-icp"), f"{tmp_path}: is not empty"),
         ((before, tmp_path / "a.osf", "--cell", "0.1"), "a.osf: --cell 0.1 is of maps (.laz, .las, .ply): leave it"),

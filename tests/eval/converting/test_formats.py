@@ -298,7 +298,9 @@ def test_a_recording_leaves_in_formats_of_points(pair: Path, tmp_path: Path, com
     np.testing.assert_array_equal(next(scans.scans()).intensity, open_session(pair / "before").scan(0).intensity)
     _, scalars = read_ply(tmp_path / "scans" / "000000.ply", ("intensity", "time"))
     np.testing.assert_allclose(scalars["time"].max(), 0.0998, atol=1e-3)
-    refused(command("convert", tmp_path / "scans", tmp_path / "b.osf"), "only a recording of an Ouster, once it is")
+    for wanted in (("b.osf",), ("b.pcap",), ("b", "--to", "pcd")):
+        told = command("convert", tmp_path / "scans", tmp_path / wanted[0], *wanted[1:])
+        refused(told, "these are bare points: name a new file that ends in .mcap, .bag, ")
 
 
 def test_rerun_reads_its_recording(pair: Path, tmp_path: Path, command: Command) -> None:
