@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +43,11 @@ _PART_WIDTHS = 3.0  # a part shorter than this is a bubble
 _TOLERANCES = (0.12, 0.06, 0.03)  # of the width, of the straight lines between nodes
 _ASIDE = 0.2  # of the width, that the line of the simulator may lie beside the traced one
 _ALIKE = 0.1  # sections that differ by less are one
+_OF_OPTIONS = (  # what mistakes in a mesh are called: by the key of a scenario, and here, where nobody gave one
+    (rf"^{re.escape(TUNNEL_KEY)}: ", ""),
+    (rf"\bset {re.escape(TUNNEL_KEY)}\.units: ", "give --units "),
+    (r"\bis units right\?", "are --units right?"),
+)
 Nodes = dict[str, tuple[float, float, float]]
 
 
@@ -101,7 +108,8 @@ def trace_mesh(
     parts = _parts_of(_find_middles(branches, walls, void), walls)
     kept = [middle for part in parts for middle in part]
     notes += judge_roof(kept, walls.file)
-    refuse_tunnel(walls.mesh, walls.file)
+    with _told_by_options():
+        refuse_tunnel(walls.mesh, walls.file)
     nodes, drifts = _place_nodes(kept, walls)
     tell("move them to the middle", 4, 4)
     return Trace(walls.file, walls.mesh, nodes, tuple(drifts), (*notes, *tell_parts(parts), *steep))
@@ -123,8 +131,9 @@ class _Walls:
 
 def _read_walls(file: MeshFile) -> _Walls:
     """Read a mesh and turn it inside out where it faces the rock."""
-    mesh = read_mesh(file.model_copy(update={"flip": False, "allow_open": True}), TUNNEL_KEY)
-    refuse_disagreeing(mesh, file)
+    with _told_by_options():
+        mesh = read_mesh(file.model_copy(update={"flip": False, "allow_open": True}), TUNNEL_KEY)
+        refuse_disagreeing(mesh, file)
     caster = Caster([mesh])
     is_flipped = is_inside_out(mesh, caster)
     if is_flipped:
@@ -133,6 +142,17 @@ def _read_walls(file: MeshFile) -> _Walls:
     is_open = len(edges_of(mesh).boundary) > 0
     file = file.model_copy(update={"flip": is_flipped, "allow_open": is_open})
     return _Walls(file, mesh, caster, typical_width_m(mesh, caster))
+
+
+@contextmanager
+def _told_by_options() -> Iterator[None]:
+    try:
+        yield
+    except ScenarioError as error:
+        told = str(error)
+        for pattern, word in _OF_OPTIONS:
+            told = re.sub(pattern, word, told)
+        raise ScenarioError(told) from error
 
 
 def _choose_cell_m(walls: _Walls) -> float:

@@ -51,6 +51,7 @@ def test_a_mesh_becomes_a_scenario_that_is_checked_and_simulated(
 
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mesh = save_drift(tmp_path / "mine.stl", 1000.0)
+    dust = save_drift(tmp_path / "dust.stl", 1e-9)
     kept = tmp_path / "kept.yaml"
     kept.write_text("")
     out = tmp_path / "new" / "mine.yaml"
@@ -64,12 +65,13 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest
         ((mesh, "--out", ""), "a scenario is a .yaml file"),
         ((mesh, "--out", tmp_path / f"{'x' * 300}.yaml"), "File name too long"),
         ((tmp_path / "\udcff.stl", "--out", out), "is not UTF-8"),
-        ((tmp_path / "none.stl", "--out", out), "no such file"),
+        ((tmp_path / "none.stl", "--out", out), f"error: {tmp_path / 'none.stl'}: no such file\n"),
+        ((dust, "--out", out), "are --units right?"),
     ):
         code, printed, err = run(capsys, "trace", *argv, "--quiet")
         assert (code, printed) == (2, "")
         assert told in err and err.count("\n") == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["kept.yaml", "mine.stl"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dust.stl", "kept.yaml", "mine.stl"]
 
 
 def test_units_that_are_named_are_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
