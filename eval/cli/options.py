@@ -76,10 +76,9 @@ def _world_names() -> list[str]:
 
 
 def _release_names() -> list[str]:
-    from importlib import resources
+    from eval.release.names import release_names
 
-    files = (resources.files("eval") / "release").iterdir()
-    return sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml"))
+    return release_names()
 
 
 _TO_SIMULATE = "give it to `tunnelcd simulate` by --world"

@@ -12,9 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import zipfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,7 +21,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, ConfigDict, Field
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import list_members, parse_json, read_member, require_plain_file
+from cdpipe.core.files import opened_zip, parse_json, read_member, require_plain_file
 from cdpipe.core.names import LONGEST, visible
 from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.io.answer import ANSWER_FILES
@@ -118,7 +116,7 @@ def read_submission(path: Path) -> CheckedFile:
         InputError: It is damaged, not complete, or of another metrics version.
     """
     n_bytes = require_plain_file(path, MOST_BYTES, _EXPECTED)
-    with _opened(path, n_bytes) as (archive, members):
+    with opened_zip(path, n_bytes, _EXPECTED) as (archive, members):
         if MANIFEST not in members:
             raise ValueError(f"no {MANIFEST} in it")
         content = parse_json(read_member(archive, members[MANIFEST]).tobytes())
@@ -180,7 +178,7 @@ def score_again(found: CheckedFile, run: RunFolder) -> int:
 
 def _iterate_answers(found: CheckedFile) -> Iterator[tuple[PairPart, dict[str, bytes]]]:
     """Yield each pair and the content of the files of its answer."""
-    with _opened(found.path, found.path.stat().st_size) as (archive, members):
+    with opened_zip(found.path, found.path.stat().st_size, _EXPECTED) as (archive, members):
         for number, pair in enumerate(found.content.pairs):
             names = {file: members[member_name(number, file)] for file in pair.files}
             yield pair, {file: read_member(archive, member).tobytes() for file, member in names.items()}
@@ -227,19 +225,6 @@ def _require_no_figures(pair: PairPart) -> None:
         is_nothing = value is None or isinstance(value, str) or (isinstance(value, float) and math.isnan(value))
         if not is_nothing and key not in _UNMADE:
             raise ValueError(f"{case}: {visible(key)[:40]} = {value} in its row, and there is no answer to it")
-
-
-@contextmanager
-def _opened(path: Path, n_bytes: int) -> Iterator[tuple[zipfile.ZipFile, Mapping[str, zipfile.ZipInfo]]]:
-    """Yield an archive and its members; whatever a damaged one provokes is one line."""
-    try:
-        with path.open("rb") as file, zipfile.ZipFile(file) as archive:
-            yield archive, list_members(file, archive, n_bytes)
-    except InputError:
-        raise
-    except Exception as error:  # zipfile and zlib let through whatever a damaged file provokes
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: {said:.300}: {_EXPECTED}") from error
 
 
 def member_name(number: int, file: str) -> str:

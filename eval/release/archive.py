@@ -10,12 +10,11 @@ import hashlib
 import re
 import shutil
 import zipfile
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping
 from pathlib import Path, PurePosixPath
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import list_members, read_bytes, read_member, require_plain_file
+from cdpipe.core.files import opened_zip, read_bytes, read_member, require_plain_file
 from cdpipe.core.names import LONGEST, visible
 from cdpipe.core.whole_file import whole_file
 from eval.core.output import new_folder
@@ -105,7 +104,7 @@ def unpack_release(file: Path, out: Path, *, with_truth: bool = False, progress:
     """
     pairs = set()
     n_bytes = require_plain_file(file, _MOST_BYTES, _EXPECTED)
-    with _opened(file, n_bytes) as (archive, members), new_folder(out) as partial:
+    with opened_zip(file, n_bytes, _EXPECTED) as (archive, members), new_folder(out) as partial:
         sums = _read_sums_of(archive, members)
         # truth last: its session.json takes the place of the blind one
         for done, (name, digest) in enumerate(sorted(sums.items())):
@@ -168,16 +167,3 @@ def _require_files(names: Collection[str], source: str) -> None:
         if name.casefold() in seen:
             raise InputError(f"{way}: stands twice: copy the release again")
         seen.add(name.casefold())
-
-
-@contextmanager
-def _opened(path: Path, n_bytes: int) -> Iterator[tuple[zipfile.ZipFile, Mapping[str, zipfile.ZipInfo]]]:
-    """Yield an archive and its members; whatever a damaged one provokes is one line."""
-    try:
-        with path.open("rb") as file, zipfile.ZipFile(file) as archive:
-            yield archive, list_members(file, archive, n_bytes)
-    except (InputError, OSError):
-        raise
-    except Exception as error:  # zipfile and zlib let through whatever a damaged file provokes
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: {said:.300}: {_EXPECTED}") from error

@@ -23,6 +23,7 @@ from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.yamlfile import Settings, read_yaml, suggest, validate
 from eval.plans.seeds import parse_seeds
 from eval.plans.splits import load_splits, version_name
+from eval.release.names import release_names
 from scenarios.grafted import GraftScenario
 from scenarios.library import load_scenario
 from scenarios.references import file_digests
@@ -59,12 +60,6 @@ class Release:
     published: date
     settings: tuple[str, ...]
     pairs: tuple[ReleasePair, ...]
-
-
-def release_names() -> list[str]:
-    """Return the names of the releases that come with the package."""
-    folder = resources.files("eval") / "release"
-    return sorted(file.name.removesuffix(".yaml") for file in folder.iterdir() if file.name.endswith(".yaml"))
 
 
 def load_release(name_or_path: str) -> Release:

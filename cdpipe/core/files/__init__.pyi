@@ -5,7 +5,7 @@ from .npz_file import read_npz
 from .plain_file import read_bytes, require_plain_file
 from .tensor_file import parse_tensors, read_tensors
 from .yaml_file import Key, YamlError, parse_yaml, parse_yaml_value
-from .zip_file import list_members, read_member
+from .zip_file import opened_zip, read_member
 
 __all__ = [
     "ArraySpec",
@@ -14,7 +14,7 @@ __all__ = [
     "Key",
     "YamlError",
     "check_types",
-    "list_members",
+    "opened_zip",
     "parse_json",
     "parse_tensors",
     "parse_yaml",

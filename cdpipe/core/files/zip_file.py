@@ -7,13 +7,19 @@ to the directory, and the directory must reach to the end of the file.
 
 from __future__ import annotations
 
+import errno
 import io
 import struct
 import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import IO, cast
 
 import numpy as np
 import numpy.typing as npt
+
+from cdpipe.core.errors import InputError
 
 # Deflate shrinks zeros a thousandfold: what a file may expand to is bounded by its own size.
 _SMALL_BYTES = 128 << 20
@@ -24,6 +30,33 @@ _IN_ZIP64_RECORD = 0xFFFF
 _HAS_DESCRIPTOR = 0x08
 _DESCRIPTOR_BYTES = (12, 16, 20, 24)  # checksum and both sizes, of 32 or 64 bits, with or without a signature
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+
+
+@contextmanager
+def opened_zip(
+    path: Path, n_bytes: int, expected: str
+) -> Iterator[tuple[zipfile.ZipFile, Mapping[str, zipfile.ZipInfo]]]:
+    """Yield an archive and its members by name.
+
+    Args:
+        path: The file.
+        n_bytes: Its size.
+        expected: What the file should be, at the end of the message.
+
+    Raises:
+        InputError: Whatever a damaged archive provokes, here or in the block, on one line.
+        OSError: The disk does not give or take what it is asked for.
+    """
+    try:
+        with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+            yield archive, list_members(file, archive, n_bytes)
+    except Exception as error:  # zipfile and zlib let through whatever a damaged file provokes
+        # a damaged directory may lead to before the start of the file
+        is_of_disk = isinstance(error, OSError) and error.errno != errno.EINVAL
+        if is_of_disk or isinstance(error, InputError):
+            raise
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: {said:.300}: {expected}") from error
 
 
 def list_members(file: IO[bytes], archive: zipfile.ZipFile, n_bytes: int) -> dict[str, zipfile.ZipInfo]:
