@@ -50,6 +50,8 @@ Origin = Annotated[
     ),
 ]
 NONE = "-"
+# which recordings need no file of an option
+_WITHOUT = {"trajectory": "has its own poses, or whose poses --odometry estimates", "metadata": "has its own"}
 _FARTHEST_M = 1e8  # as poses may lie
 
 
@@ -220,7 +222,7 @@ def _each(name: str, values: list[str] | None, n_inputs: int) -> list[Path | Non
         what = "one recording" if n_inputs == 1 else f"{n_inputs} recordings"
         raise InputError(
             f"--{name}: given {len(values)} times for {what}: give it once for each, in their order"
-            + (f"; {NONE} for one that has its own" if n_inputs > 1 else "")
+            + (f"; {NONE} for one that {_WITHOUT[name]}" if n_inputs > 1 else "")
         )
     return [None if value == NONE else Path(value) for value in values]
 

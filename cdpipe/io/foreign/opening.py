@@ -65,7 +65,7 @@ class HowToRead:
         if self.format is not None:
             require_format_name(self.format)
         if self.odometry is not None and self.odometry not in ODOMETRIES:
-            raise InputError(f"--odometry {self.odometry}: expected {' or '.join(ODOMETRIES)}")
+            raise InputError(f"--odometry {self.odometry}: expected {' or '.join(ODOMETRIES)} (a file: --trajectory)")
         if self.odometry is not None and self.trajectory is not None:
             raise InputError("--trajectory and --odometry both give the poses: leave one out")
 

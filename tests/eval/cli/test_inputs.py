@@ -37,7 +37,13 @@ def test_what_detect_says_of_recordings_and_their_options(tmp_path: Path, comman
     refused(command("detect", bag, tmp_path / "friday", *out), "friday: no such file or folder")
     refused(command("detect", bag, folder, *out), "run: expected exactly one trajectory")
     refused(command("detect", bag, folder, "--trajectory", poses, *out), "--trajectory: given 1 times for 2 recordings")
+    mixed = ("--odometry", "kiss-icp", "--trajectory", poses)
+    refused(
+        command("detect", bag, folder, *mixed, *out),
+        "- for one that has its own poses, or whose poses --odometry estimates",
+    )
     refused(command("detect", bag, bag, "--odometry", "slam", *out), "--odometry slam: expected kiss-icp")
+    refused(command("detect", bag, bag, "--odometry", poses, *out), "kiss-icp or genz-icp (a file: --trajectory)")
     one = ("--trajectory", poses, "--odometry")
     refused(command("describe", folder, *one, "nonsense"), "--odometry nonsense: expected kiss-icp")
     refused(command("describe", folder, *one, "kiss-icp"), "--trajectory and --odometry both give the poses")
