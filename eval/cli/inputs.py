@@ -22,7 +22,9 @@ Format = Annotated[
 ]
 Topics = Annotated[
     list[str] | None,
-    typer.Option("--topic", metavar="NAME", help="topic of a bag, of clouds or of poses; may be repeated"),
+    typer.Option(
+        "--topic", metavar="NAME", help="topic of a bag, clouds or poses; again for a second, or for the other bag"
+    ),
 ]
 Trajectories = Annotated[
     list[str] | None,
@@ -157,9 +159,11 @@ def open_inputs(paths: Sequence[Path], hows: Sequence[HowToRead], progress: RunP
     Raises:
         InputError: One cannot be read, or options are given for sessions alone.
     """
+    from cdpipe.io.foreign import share_topics
     from cdpipe.io.readers import open_session
 
     guess_formats(paths, hows)  # a long reading does not end at a wrong second name
+    hows = share_topics(paths, hows)
     opened: list[Path | ScanSource] = []
     for path, checked in zip(paths, _check_sessions(paths, hows), strict=True):
         source = path if checked is None else open_session(path, checked, progress.stage)

@@ -11,7 +11,7 @@ from pathlib import Path
 from cdpipe.core.errors import InputError, MergeFailedError, ScenarioError
 from cdpipe.core.geometry import Float64Array
 from cdpipe.core.progress import Progress, report_nothing
-from cdpipe.io.foreign import HowToRead, guess_format
+from cdpipe.io.foreign import HowToRead, guess_format, share_topics
 from cdpipe.io.foreign.sniff import OUSTER
 from cdpipe.io.known_merge import read_known_merge
 from cdpipe.io.readers import RecordedScans, import_ouster, open_session
@@ -70,16 +70,17 @@ def open_recorded(recording: Recording, on_progress: Progress = report_nothing) 
         InputError: One cannot be read, or the file of the merge holds none.
         ScenarioError: No merge is found.
     """
+    paths = [Path(name) for name in recording.sessions]
+    hows = share_topics(paths, [_how(recording, number) for number in range(len(paths))])
     with tempfile.TemporaryDirectory(prefix="tunnelcd-graft-") as folder:
         sessions = tuple(
-            _open(Path(name), _how(recording, number), Path(folder) / str(number), on_progress)
-            for number, name in enumerate(recording.sessions)
+            _open(path, how, Path(folder) / str(number), on_progress)
+            for number, (path, how) in enumerate(zip(paths, hows, strict=True))
         )
         if len(sessions) == 1:
             yield Recorded(sessions)
         elif recording.before_T_after is not None:
-            names = enumerate(recording.sessions)
-            origins_m = [_how(recording, number).subtracted_m(Path(name)) for number, name in names]
+            origins_m = [how.subtracted_m(path) for how, path in zip(hows, paths, strict=True)]
             yield Recorded(sessions, read_known_merge(Path(recording.before_T_after), origins_m), "given")
         else:
             yield Recorded(sessions, _find_merge(sessions, on_progress), "tunnelcd")

@@ -1,5 +1,6 @@
 from .opening import HowToRead, convert_recording, folder_of_options, open_recording
 from .sniff import FORMATS, guess_format, holds_scans
+from .topics import share_topics
 from .trajectory import Trajectory, read_poses
 
 __all__ = [
@@ -12,4 +13,5 @@ __all__ = [
     "holds_scans",
     "open_recording",
     "read_poses",
+    "share_topics",
 ]

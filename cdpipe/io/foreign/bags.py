@@ -69,8 +69,7 @@ class BagScans:
         self._topics = [(name, kind, count) for name, kind, count in about["topics"] if count]
         unknown = sorted(set(topics) - {name for name, *_ in self._topics})
         if unknown:
-            way = "; `tunnelcd convert` one of two recordings first if their topics differ" if len(topics) > 1 else ""
-            raise InputError(f"{path}: --topic {unknown[0]}: not in it: it holds {self._listed()}{way}")
+            raise InputError(f"{path}: --topic {unknown[0]}: not in it: it holds {self._listed()}")
         self._topic = self._choose(CLOUD, topics, "PointCloud2")
         stamps, has_returns = self._look_through(report)
         # cloud of the topic that each scan is, scans in the order of their stamps

@@ -10,8 +10,9 @@ pytest.importorskip("pypcd4", reason="pip install 'tunnelcd[formats]'")
 pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
 
 from cdpipe.core.errors import InputError
+from cdpipe.io.foreign import share_topics
 from cdpipe.io.readers import open_session
-from eval.cli.inputs import read_metres
+from eval.cli.inputs import how_to_read, read_metres
 from tests.cdpipe.io.foreign_files import drive, write_bag, write_pcds, write_trajectory
 from tests.eval.cli.test_converting import Command, refused
 
@@ -86,6 +87,22 @@ def test_the_same_bag_twice_is_said(tmp_path: Path, command: Command) -> None:
     bag = write_bag(tmp_path / "a.bag", drive(3, 900))
     _, _, err = command("detect", bag, bag, "--out", tmp_path / "out")
     assert "one and the same recording" in err
+
+
+def test_two_bags_may_name_their_clouds_differently(tmp_path: Path, command: Command) -> None:
+    made, shared = drive(3, 60), "/spare/points"
+    paths = [write_bag(tmp_path / f"{name}.bag", made, "tf", (f"/{name}/points", shared)) for name in "ab"]
+
+    def topics_of(*named: str) -> list[str]:
+        hows = how_to_read(2, None, [*named], None, None, None, deskew=True)
+        return [how.topics[0] for how in share_topics(paths, hows)]
+
+    assert topics_of("/a/points", "/b/points") == topics_of("/b/points", "/a/points") == ["/a/points", "/b/points"]
+    assert topics_of(shared) == [shared, shared]
+    both = ("--topic", "/a/points", "--topic", "/b/points", "--out", tmp_path / "out")
+    _, _, err = command("detect", *paths, *both)
+    assert "--topic" not in err and "topics of PointCloud2" not in err
+    refused(command("detect", *paths, "--topic", "/c", *both), "a.bag: --topic /c: not in it")
 
 
 def test_descriptors_of_other_options_are_stored_apart(tmp_path: Path, command: Command) -> None:

@@ -1,0 +1,46 @@
+"""Topics that a person names for two bags at once, whose robots may call them differently."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from cdpipe.core.isolated_reader import IsolatedReader
+from cdpipe.core.plugins import require_extra
+from cdpipe.io.foreign.opening import HowToRead
+from cdpipe.io.foreign.packed_bags import unpack_bag
+from cdpipe.io.foreign.sniff import guess_format
+
+
+def share_topics(paths: Sequence[Path], hows: Sequence[HowToRead]) -> list[HowToRead]:
+    """Return how to read recordings, each bag with the topics that it holds; what none holds stays named for all.
+
+    Raises:
+        InputError: A bag cannot be read.
+    """
+    named = [(path, how) for path, how in zip(paths, hows, strict=True) if how.topics]
+    bags = {path for path, how in named if (how.format or guess_format(path)) == "bag"}
+    if len(bags) < 2:
+        return list(hows)
+    held = {path: _list_topics(path) for path in bags}
+    some = set().union(*held.values())
+    of_others = {path: some - own for path, own in held.items()}
+    return [
+        replace(how, topics=tuple(name for name in how.topics if name not in of_others.get(path, ())))
+        for path, how in zip(paths, hows, strict=True)
+    ]
+
+
+def _list_topics(path: Path) -> set[str]:
+    """Return the topics of a bag with a message."""
+    require_extra("formats", str(path))
+    reader = IsolatedReader("cdpipe.io.foreign.bag_files", path, "rosbags")
+    unpacked = unpack_bag(path, reader)
+    try:
+        ((about, _),) = reader.read("list_topics", path=str(unpacked or path))
+    finally:
+        if unpacked is not None:
+            shutil.rmtree(unpacked.parent, ignore_errors=True)
+    return {name for name, _, count in about["topics"] if count}
