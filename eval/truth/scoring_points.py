@@ -21,7 +21,7 @@ import numpy.typing as npt
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArraySpec, read_npz
 from cdpipe.core.geometry import Float32Array, Int32Array, Int64Array, require_shapes, transform
-from cdpipe.core.geometry.voxel import cell_keys
+from cdpipe.core.geometry.voxel import cell_keys, max_coordinate_m
 from cdpipe.core.whole_file import whole_file
 from cdpipe.io.readers import open_session
 from cdpipe.io.session import Session, chunk_path, read_session
@@ -246,6 +246,8 @@ def _read_cache(path: Path, fingerprint: str, session: Session) -> ScoringPoints
         returns = arrays["returns"]
         is_within = (returns >= 0) & (returns < session.n_scans * n_pixels)
         if not is_within.all() or (np.diff(returns) <= 0).any():
+            return None
+        if not (np.abs(arrays["points_odom"]) <= max_coordinate_m(CELL_M)).all():
             return None
         return ScoringPoints(**arrays, n_scans=session.n_scans, n_pixels=n_pixels)
     except (InputError, ValueError):

@@ -288,10 +288,16 @@ def read_mover_track(session: Path) -> MoverTrack | None:
     """Read where the movers of one session were; None where none moved.
 
     Raises:
-        InputError: The file is damaged.
+        InputError: The file is damaged, or a mover was seen too far away.
     """
     path = session / "truth" / "movers.npz"
-    return MoverTrack(**read_npz(path, _TRACK)) if path.is_file() else None
+    if not path.is_file():
+        return None
+    track = MoverTrack(**read_npz(path, _TRACK))
+    # this form also refuses NaN
+    if not (np.abs(track.seen_world[track.n_returns > 0]) <= FARTHEST_M).all():
+        raise InputError(f"{path}: damaged: a mover was seen nowhere, or farther than {FARTHEST_M:g} m from the origin")
+    return track
 
 
 def read_labels(session: Path, n_chunks: int) -> Iterator[tuple[Int16Array, Int16Array]]:

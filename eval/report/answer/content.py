@@ -82,7 +82,7 @@ def _require_shown(folder: Path, report: ChangeReport) -> None:
     for name, points in told.items():
         farthest_m = float(np.abs(points).max(initial=0.0))
         if not farthest_m < (most_m := max_coordinate_m(FINEST_CELL_M)):
-            where = f"{folder}: {name} reaches {farthest_m:.0f} m from the origin"
+            where = f"{folder}: {name} reaches {farthest_m:g} m from the origin"
             raise InputError(f"{where}: expected places in the sessions' odom frames, within {most_m:.0f} m")
 
 

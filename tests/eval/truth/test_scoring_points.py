@@ -152,6 +152,19 @@ def test_a_cache_that_names_returns_that_are_not_there_is_built_again(
     np.testing.assert_array_equal(load_scoring_points(session).points_odom, expected)
 
 
+@pytest.mark.parametrize(("place_m", "is_used"), [(104_857.5, True), (104_858.0, False), (-104_858.0, False)])
+def test_a_cache_with_points_beyond_all_cells_is_built_again(tiny_pair: Path, place_m: float, is_used: bool) -> None:
+    session = tiny_pair / "after"
+    built = load_scoring_points(session)
+    path = session / "truth" / "scoring_points.npz"
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    arrays["points_odom"][5, 1] = place_m
+    np.savez(path, **arrays)
+    expected = arrays["points_odom"] if is_used else built.points_odom
+    np.testing.assert_array_equal(load_scoring_points(session).points_odom, expected)
+
+
 def test_truth_that_is_too_far_away_is_one_line(tiny_pair: Path) -> None:
     poses = read_true_poses(tiny_pair / "before")
     poses[3, 0, 3] = 1e200

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import transform
 from cdpipe.sensor.ouster import SensorMetadata
 from scenarios import load_scenario
@@ -16,7 +17,7 @@ from sim.session import simulate
 from sim.session.planning import plan_drives
 from sim.session.revolution import simulate_revolution
 from sim.session.simulate import simulate_in_memory, simulate_pair
-from sim.session.truth import read_labels, read_mover_track, read_pair_truth, read_true_poses
+from sim.session.truth import read_labels, read_mover_track, read_pair_truth, read_true_poses, write_mover_track
 
 SEED = 11
 
@@ -89,6 +90,17 @@ def test_returns_on_a_mover_lie_on_it_at_their_own_time(moving_scenario: Scenari
             assert (local > truck.figure.extent.low).all() and (local < truck.figure.extent.high).all()
         n_seen += len(row)
     assert n_seen > 500
+
+
+@pytest.mark.parametrize("place_m", [np.nan, np.inf, -1e8])
+def test_a_mover_that_was_seen_nowhere_or_too_far_away_is_one_line(place_m: float, pair: Path, tmp_path: Path) -> None:
+    track = read_mover_track(pair / "after")
+    assert track is not None
+    mover, scan = np.argwhere(track.n_returns > 0)[0]
+    track.seen_world[mover, scan, 1] = place_m
+    write_mover_track(tmp_path, track)
+    with pytest.raises(InputError, match=r"movers\.npz: damaged: a mover was seen nowhere, or farther than 1e\+07 m"):
+        read_mover_track(tmp_path)
 
 
 def test_a_scenario_without_movers_knows_nothing_of_them(tmp_path: Path) -> None:
