@@ -16,7 +16,8 @@ from eval.core.statistics import ENOUGH_PAIRS
 from eval.report.drawing.charts import Chart
 from eval.running.results.cases import BEST_POINTS, named_variants, scenarios, shows_best_points
 from eval.running.results.run_data import RunData
-from eval.running.results.values import Row, defined, flag, interval_over_pairs, over_pairs, select_rows, text
+from eval.running.results.values import Row, defined, interval_over_pairs, over_pairs, select_rows, text
+from eval.tables.alarms import count_alarms
 from eval.tables.columns import (
     EN_DASH,
     RESULT_COLUMNS,
@@ -134,8 +135,11 @@ def _captioned(words: str, data: RunData) -> str:
 
 def alarm_text(group: Sequence[Row]) -> str:
     """Return "alarm", "silent" or "refused" of one pair, or how many of several."""
+    rows = pd.DataFrame(list(group))
+    alarms = count_alarms(rows) if "is_alarm" in rows else np.zeros(len(rows))
     return _counted(
-        "refused" if text(row, "status") != "ok" else "alarm" if flag(row, "is_alarm") else "silent" for row in group
+        "refused" if text(row, "status") != "ok" else "alarm" if alarm == 1 else "silent"
+        for row, alarm in zip(group, alarms, strict=True)
     )
 
 

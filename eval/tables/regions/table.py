@@ -18,6 +18,7 @@ from cdpipe.core.geometry import Float64Array
 from cdpipe.core.ranking import auroc
 from eval.core.statistics import interval_of, mean, median
 from eval.plans.targets import Targets
+from eval.tables.alarms import count_alarms
 from eval.tables.conditions import by_condition, told_apart
 from eval.tables.groups import recall_by_size
 from eval.tables.regions.budgets import budget_rows
@@ -143,10 +144,10 @@ def _counts(own: pd.DataFrame) -> dict[str, Any]:
     answered = own[own["status"] == "ok"]
     path_m, n_false = numbers(answered, "after_path_m").sum(), numbers(answered, "n_false_regions").sum()
     unchanged = own[is_unchanged_pair(own)]
-    alarms = numbers(unchanged, "is_alarm")
-    n_silent, n_unchanged = int((alarms == 0).sum()), len(unchanged)
-    unchanged_m = numbers(unchanged, "after_path_m")[~np.isnan(alarms)].sum()
-    n_false_unchanged = np.nansum(numbers(unchanged, "n_false_regions")[~np.isnan(alarms)])
+    is_silent, is_answered = count_alarms(unchanged) == 0, ~np.isnan(numbers(unchanged, "is_alarm"))
+    n_silent, n_unchanged = int(is_silent.sum()), len(unchanged)
+    unchanged_m = numbers(unchanged, "after_path_m")[is_answered].sum()
+    n_false_unchanged = np.nansum(numbers(unchanged, "n_false_regions")[is_answered])
     map_bytes, kept_bytes = numbers(answered, "bytes_map_before"), numbers(answered, "bytes_regions_before")
     return {
         "n_pairs": len(own),
@@ -163,7 +164,7 @@ def _counts(own: pd.DataFrame) -> dict[str, Any]:
         "n_unchanged": n_unchanged,
         "n_silent": n_silent,
         "silent_share": n_silent / n_unchanged if n_unchanged else math.nan,
-        **dict(zip(("silent_low", "silent_high"), wilson_over_tunnels(alarms == 0, unchanged), strict=True)),
+        **dict(zip(("silent_low", "silent_high"), wilson_over_tunnels(is_silent, unchanged), strict=True)),
         "km_unchanged": unchanged_m / 1000.0,
         "false_regions_per_100m_unchanged": 100.0 * n_false_unchanged / unchanged_m if unchanged_m > 0 else math.nan,
         "bytes_map_before": _mean_of_all(map_bytes),

@@ -3,7 +3,7 @@ import html
 import json
 import re
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,8 @@ from cdpipe.model.report import ChangedObject, ChangeRegions, ChangeReport
 from cdpipe.sensor.ouster import parse_metadata
 from eval.report.page import write_page
 from eval.report.site.site import truth_marks
+from eval.report.tables import unchanged_table
+from eval.running.results.run_data import read_run
 from eval.running.runfolder import RunFolder
 from eval.truth.ground_truth import load_ground_truth
 from sim.session.truth import PairTruth, write_labels, write_pair_truth, write_true_poses
@@ -288,6 +290,14 @@ def test_the_unchanged_pair_has_its_own_rows(page: Path) -> None:
         ["tunnelcd", "silent", "0", "0", "0.00", "-", "-", "0.0625", "ok"],
         ["voxel-diff", "refused", "0", "-", "-", "-", "-", "-", "merge refused"],
     ]
+
+
+def test_objects_where_nothing_changed_are_an_alarm_on_the_page(run: Path) -> None:
+    data = read_run(run)
+    rows = [{**row, "n_objects": 2 if row["variant"] == "tunnelcd" else 0} for row in data.results]
+    table = unchanged_table(replace(data, results=tuple(rows)))
+    told = {cells[0].text: cells[1].text for _, cells in table.rows}
+    assert told == {"paper": "alarm", "tunnelcd": "alarm", "voxel-diff": "refused"}
 
 
 def test_tables_one_and_two_stand_beside_the_papers_values(page: Path) -> None:

@@ -108,6 +108,10 @@ def test_a_row_by_hand() -> None:
     # one of three silent: a refusal is neither silent nor an alarm, but it is a pair
     assert (row["n_silent"], row["n_unchanged"], row["silent_share"]) == (1, 3, pytest.approx(1 / 3))
     assert (row["silent_low"], row["silent_high"]) == wilson_interval(1, 3)
+    # objects without regions break the silence, too
+    loud = the_row(tables([{**each, "n_objects": 1} for each in rows])["regions_table"], "in")
+    assert (loud["n_silent"], loud["n_unchanged"], loud["km_unchanged"]) == (0, 3, 2.0)
+    assert (loud["silent_low"], loud["silent_high"]) == wilson_interval(0, 3)
     assert (row["bytes_map_before"], row["bytes_regions_before"], row["bytes_ratio"]) == (1000.0, 100.0, 10.0)
     # two refusals of six pairs of 1 km each count as 10 false regions at 0.1 per 100 m, and as 50 at 0.5
     assert (row["recall_at_0.1"], row["recall_at_0.5"]) == (0.0, 0.0)
