@@ -31,7 +31,8 @@ OBJECT_COLUMNS = (
     Column("object_precision_50", "precision at 0.5", "high", share, "Matched objects among all that count.",
            "0 where none was answered; undefined where nothing changed and none was."),
     Column("kind_accuracy", "kind right", "high", share,
-           "Added, removed, moved (with the right partner), reshaped, among those matched.",
+           "Added, removed, moved (with the right partner), reshaped, among those matched; mean over pairs. n: how "
+           "many observable objects of all pairs were matched, short moves and reshaped ones left out.",
            "0 where none was matched; undefined where nothing changed."),
     Column("displacement_error_m", "moved, off by [cm]", None, _cm,
            "Answered displacement against the true one, map frame: median over matched halves of moves.",
@@ -46,7 +47,7 @@ OBJECT_COLUMNS = (
            "holds times the share of changed points that one holds; mean over pairs."),
 )  # fmt: skip
 OBJECT_COUNTS = {
-    "iou_matched_median": "n_matched", "displacement_error_m": "n_displacements",
+    "iou_matched_median": "n_matched", "kind_accuracy": "n_matched", "displacement_error_m": "n_displacements",
     "pile_volume_error": "n_piles", "object_iou_point_partial": "n_partial",
 }  # fmt: skip
 WITHDRAWAL_COLUMNS = (

@@ -183,6 +183,17 @@ def test_the_best_is_among_those_that_ask_no_truth(run: Path) -> None:
     assert [cell.text for cell in first] == ["tunnelcd", "6", "6", "1.00", "0.50", "0.50", "0.00", "3", "1"]
 
 
+def test_no_answer_is_the_best_for_the_few_that_it_matched(run: Path) -> None:
+    own = pd.read_csv(run / "objects_table.csv").query("domain == 'in' and variant == 'tunnelcd'")
+    answers = ({"variant": "good", "kind_accuracy": 0.9, "n_matched": 9}, {"kind_accuracy": 0.5, "n_matched": 9},
+               {"variant": "surest-alone", "kind_accuracy": 1.0, "n_matched": 1})  # fmt: skip
+    rows = pd.concat([own.assign(**each) for each in answers])
+    shown = methods_table(rows, OBJECT_COLUMNS, with_domain(read_run(run).results), "", counts=OBJECT_COUNTS)
+    place = shown.headings.index("kind right")
+    assert [cells[place].is_best for _, cells in shown.rows] == [True, False, False]
+    assert shown.rows[2][1][place].interval.endswith("n 1")
+
+
 def test_the_rivals_iou_stands_beside_in_every_group(run: Path) -> None:
     data = read_run(run)
     assert voxel_variants(data, "tunnelcd") == [VOXEL]
