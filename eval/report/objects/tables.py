@@ -42,9 +42,10 @@ OBJECT_COLUMNS = (
            "Undefined where no volume was answered."),
     Column("object_iou_point_partial", "short moves, reshaped: IoU", "high", share,
            "Point IoU of the group `partial`, which is in no other column but kind and displacement."),
-    Column("associated_accuracy", "AA", "high", share,
+    Column("associated_accuracy", "AA", None, share,
            "Associated accuracy of DynamicMap_Benchmark: the root of the share of unchanged points that no object "
-           "holds times the share of changed points that one holds; mean over pairs."),
+           "holds times the share of changed points that one holds; mean over pairs. Padded objects raise it and lower "
+           "IoU, so it is read beside IoU and F1, and none is marked as best."),
 )  # fmt: skip
 OBJECT_COUNTS = {
     "iou_matched_median": "n_matched", "kind_accuracy": "n_matched", "displacement_error_m": "n_displacements",

@@ -103,6 +103,28 @@ def test_calling_all_props_changes_costs_quality_and_f1(tiny_pair: Path, tiny_me
     assert row["object_pq"] == row["object_f1_50"] == pytest.approx(3 / (3 + 32 / 2))
 
 
+def test_padding_raises_the_associated_accuracy_and_lowers_iou(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
+    # each object lacks its last three returns, or has them and twelve of what stayed besides
+    report, truth = true_report(tiny_pair, tiny_merge), load_ground_truth(tiny_pair)
+    cut, padded = [], []
+    for place, item in enumerate(report.objects):
+        cut.append(replace(item, returns=item.returns[:-3], points_map=item.points_map[:-3]))
+        points = truth.sessions[item.session].scoring_points
+        rows = np.flatnonzero(points.change == 0)[12 * place : 12 * place + 12]
+        walls = np.column_stack([points.scans(rows), points.pixels(rows)]).astype(np.int32)
+        at = to_map(item.session, points.points_odom[rows].astype(np.float64), tiny_merge)
+        padded.append(
+            replace(
+                item,
+                returns=np.concatenate([item.returns, walls]),
+                points_map=np.concatenate([item.points_map, at]),
+            )
+        )
+    plain, more = (scored(tiny_pair, replace(report, objects=tuple(items))).row for items in (cut, padded))
+    assert more["associated_accuracy"] > plain["associated_accuracy"]
+    assert more["object_iou_point"] < plain["object_iou_point"]
+
+
 def test_the_whole_map_as_one_object_scores_nearly_nothing(tiny_pair: Path, honest: ChangeReport) -> None:
     truth = load_ground_truth(tiny_pair)
     row = scored(tiny_pair, replace(honest, objects=everything_as_objects(truth, honest.before_T_after))).row

@@ -194,6 +194,15 @@ def test_no_answer_is_the_best_for_the_few_that_it_matched(run: Path) -> None:
     assert shown.rows[2][1][place].interval.endswith("n 1")
 
 
+def test_associated_accuracy_leads_no_table(run: Path) -> None:
+    own = pd.read_csv(run / "objects_table.csv").query("domain == 'in' and variant == 'tunnelcd'")
+    answers = ({"associated_accuracy": 0.97}, {"variant": "padded", "associated_accuracy": 0.99})
+    rows = pd.concat([own.assign(**each) for each in answers])
+    shown = methods_table(rows, OBJECT_COLUMNS, with_domain(read_run(run).results), "", counts=OBJECT_COUNTS)
+    cells = [cells[shown.headings.index("AA")] for _, cells in shown.rows]
+    assert [(cell.text, cell.is_best) for cell in cells] == [("0.97", False), ("0.99", False)]
+
+
 def test_the_rivals_iou_stands_beside_in_every_group(run: Path) -> None:
     data = read_run(run)
     assert voxel_variants(data, "tunnelcd") == [VOXEL]
