@@ -73,14 +73,13 @@ def require_page(out: Path) -> None:
     require_replaceable(out, _HEAD, "page of `tunnelcd leaderboard`")
 
 
-def write_leaderboard(files: Sequence[CheckedFile], out: Path, reference: Path | None, checked: Sequence[int]) -> None:
+def write_leaderboard(files: Sequence[CheckedFile], out: Path, reference: Path | None) -> None:
     """Write the page.
 
     Args:
         files: The submissions.
         out: The .html file.
         reference: Where reference results are, as in `find_reference`.
-        checked: How many answers of each submission were scored again.
 
     Raises:
         InputError: Two submissions are of one method on the same pairs, or a file cannot be read or written.
@@ -89,9 +88,9 @@ def write_leaderboard(files: Sequence[CheckedFile], out: Path, reference: Path |
     boards = [board for group in _group(files) for board in _make_boards(group, reference)]
     told = [
         {"name": each.content.name, "file": each.path.name, "sha256": each.sha256, "content": each.content,
-         "command": " ".join(each.content.command), "n_checked": n,
+         "command": " ".join(each.content.command), "n_checked": each.n_checked,
          "version": each.content.versions.get("tunnelcd", "")}
-        for each, n in zip(files, checked, strict=True)
+        for each in files
     ]  # fmt: skip
     columns = [(heading, SHOWN[key]) for key, heading in HEADINGS.items()]
     headings = ("method", "merge", "pairs", *HEADINGS.values())

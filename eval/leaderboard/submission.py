@@ -13,7 +13,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
@@ -102,11 +102,19 @@ class Submission(Settings):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedFile:
-    """A submission whose digests are right: its file, the digest of that, its content."""
+    """A submission whose digests are right.
+
+    Attributes:
+        path: Its file.
+        sha256: The digest of the file.
+        content: Its content; rows that were scored again are those of the scoring.
+        n_checked: How many pairs were scored again.
+    """
 
     path: Path
     sha256: str
     content: Submission
+    n_checked: int = 0
 
 
 def read_submission(path: Path) -> CheckedFile:
@@ -137,7 +145,7 @@ def read_submission(path: Path) -> CheckedFile:
     return CheckedFile(path, digest_file(path), document)
 
 
-def score_again(found: CheckedFile, run: RunFolder) -> int:
+def score_again(found: CheckedFile, run: RunFolder) -> CheckedFile:
     """Score the answers of a submission by the truth of a run's pairs, and compare the rows.
 
     Args:
@@ -145,13 +153,14 @@ def score_again(found: CheckedFile, run: RunFolder) -> int:
         run: A run folder with the same pairs.
 
     Returns:
-        How many pairs were scored; a pair that cannot be made has no answer and, as `read_submission` saw, no figure.
+        The submission with the rows that scoring gave: what is within rounding may still decide between two methods.
+        A pair that cannot be made has no answer and, as `read_submission` saw, no figure; its row stays.
 
     Raises:
         InputError: The run lacks a pair or holds another simulation of it, or one of a pair that has no answer as it
             cannot be made; or a row is not that of its answer.
     """
-    n_scored = 0
+    pairs: list[PairPart] = []
     for pair, files in _iterate_answers(found):
         original, case = run.pair(pair.scenario, pair.seed), f"{pair.scenario} {pair.seed}"
         if not files:
@@ -160,6 +169,7 @@ def score_again(found: CheckedFile, run: RunFolder) -> int:
                     f"{found.path}: {case}: no answer, as a pair that cannot be made; {run.path} holds it: evaluate "
                     "and submit again"
                 )
+            pairs.append(pair)
             continue
         if digest_pair(original) != pair.pair_digest:
             raise InputError(f"{run.path}: holds no pair {case} as {found.path} answers it: simulate it anew")
@@ -167,13 +177,16 @@ def score_again(found: CheckedFile, run: RunFolder) -> int:
             for name, content in files.items():
                 Path(answer, name).write_bytes(content)
             score = score_stored(load_ground_truth(original), Path(answer))
-        for key, value in score.row.items():
-            if key not in _NAMES | score.plugins and not _is_same(pair.row.get(key), value):
+        scored = {key: _plain(value) for key, value in score.row.items() if key not in _NAMES}
+        for key, value in scored.items():
+            if key not in score.plugins and not _is_same(pair.row.get(key), value):
                 raise InputError(
                     f"{found.path}: {case}: {key} = {pair.row.get(key)} in its row, and its answer scores {value}"
                 )
-        n_scored += 1
-    return n_scored
+        own = {key: value for key, value in pair.row.items() if key in _NAMES}
+        pairs.append(pair.model_copy(update={"row": {**own, **scored}}))
+    n_scored = sum(bool(pair.files) for pair in pairs)
+    return replace(found, content=found.content.model_copy(update={"pairs": pairs}), n_checked=n_scored)
 
 
 def _iterate_answers(found: CheckedFile) -> Iterator[tuple[PairPart, dict[str, bytes]]]:
@@ -232,9 +245,13 @@ def member_name(number: int, file: str) -> str:
     return f"answers/{number:05d}/{file}"
 
 
-def _is_same(stored: Any, scored: Any) -> bool:
+def _plain(scored: Any) -> Any:
+    """Return a value of a row that scoring gave as a row in a file holds it."""
+    return json.loads(json.dumps(scored, default=lambda value: value.item()))
+
+
+def _is_same(stored: Any, plain: Any) -> bool:
     """Tell whether a value of a row is what scoring gave."""
-    plain = json.loads(json.dumps(scored, default=lambda value: value.item()))
     if isinstance(plain, str) or plain is None:
         return bool(stored == plain)
     if not isinstance(stored, bool | int | float):

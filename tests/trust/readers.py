@@ -488,7 +488,7 @@ def _read_submission(folder: Path) -> None:
     with zipfile.ZipFile(folder / "again.zip", "w") as archive:
         for path in sorted(path for path in (folder / "unpacked").rglob("*") if path.is_file()):
             archive.write(path, path.relative_to(folder / "unpacked"))
-    write_leaderboard([read_submission(folder / "again.zip")], folder / "board.html", None, [0])
+    write_leaderboard([read_submission(folder / "again.zip")], folder / "board.html", None)
 
 
 def _release(folder: Path) -> None:

@@ -164,12 +164,12 @@ def leaderboard(
 
     require_page(out)
     run = None if pairs is None else open_run_folder(pairs)
-    found, checked = [], []
+    found = []
     with shown_progress(quiet) as progress:
         for done, path in enumerate(files):
             progress.cells(str(path), done, len(files))
-            found.append(read_submission(path))
-            checked.append(0 if run is None else score_again(found[-1], run))
+            each = read_submission(path)
+            found.append(each if run is None else score_again(each, run))
         progress.cells("done", len(files), len(files))
-    write_leaderboard(found, out, reference, checked)
+    write_leaderboard(found, out, reference)
     echo(f"page: {out}")

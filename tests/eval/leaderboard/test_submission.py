@@ -7,6 +7,7 @@ import re
 import shutil
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,7 @@ def test_what_was_packed_is_read_and_scored_again(evaluated: RunFolder, packed: 
         (ONE_BOX, 20000),
         ("smoke/unchanged", 20000),
     ]
-    assert score_again(found, evaluated) == 2
+    assert score_again(found, evaluated).n_checked == 2
     # no folder of this machine is in it
     text = found.content.model_dump_json()
     assert str(evaluated.path) not in text and "script.py" in text and str(evaluated.path.parent) not in text
@@ -218,6 +219,16 @@ def test_a_row_that_its_answer_does_not_earn_is_found(evaluated: RunFolder, pack
         score_again(found, evaluated)
 
 
+def test_the_page_is_made_of_the_rows_that_were_scored_again(evaluated: RunFolder, packed: Path) -> None:
+    # less than what rounding may differ by: enough to stand before an equal answer
+    scored = score_again(read_submission(rewrite(packed, in_row(object_f1_50=9e-7, theirs=3.0))), evaluated)
+    row = scored.content.pairs[0].row
+    assert row["object_f1_50"] == 0.0 and "theirs" not in row and row["variant"] == "mine"
+    assert {name: row[name] for name in ("scenario", "seed")} == {"scenario": ONE_BOX, "seed": 20000}
+    with pytest.raises(InputError, match="domain = in"):
+        score_again(read_submission(rewrite(packed, in_row(domain="in"))), evaluated)
+
+
 @pytest.mark.parametrize(
     "claim",
     [{"object_iou_point": float("nan")}, {"false_regions_per_100m": None}, {"t_total_s": 0.0}, {"n_objects": 99}],
@@ -262,7 +273,7 @@ def test_a_pair_without_an_answer_has_no_figures(run: RunFolder, packed: Path) -
     with pytest.raises(InputError, match="smoke/one_box 20000: no answer, as a pair that cannot be made"):
         score_again(unmade, run)
     shutil.rmtree(run.pair(ONE_BOX, 20000))
-    assert score_again(unmade, run) == 1
+    assert score_again(unmade, run).n_checked == 1
 
 
 def test_a_pair_that_was_made_has_an_answer(packed: Path) -> None:
@@ -303,7 +314,7 @@ def renamed(found: CheckedFile, name: str) -> CheckedFile:
 def test_the_page_shows_every_file_escaped(packed: Path, tmp_path: Path) -> None:
     found = read_submission(packed)
     evil = renamed(found, "<script>alert(1)</script>\x1b[2J")
-    write_leaderboard([found, evil], tmp_path / "out" / "board.html", None, [2, 0])
+    write_leaderboard([replace(found, n_checked=2), evil], tmp_path / "out" / "board.html", None)
     page = (tmp_path / "out" / "board.html").read_text()
     assert "&lt;script&gt;alert(1)" in page and "<script>alert" not in page and "\x1b" not in page
     assert page.count('class="entry"') == 2 and "Plan smoke, 2 pairs" in page
@@ -315,7 +326,7 @@ def test_the_page_shows_every_file_escaped(packed: Path, tmp_path: Path) -> None
 def test_every_heading_of_the_leaderboard_is_defined_under_the_name_that_it_has_there(
     packed: Path, tmp_path: Path
 ) -> None:
-    write_leaderboard([read_submission(packed)], tmp_path / "board.html", None, [0])
+    write_leaderboard([read_submission(packed)], tmp_path / "board.html", None)
     page = (tmp_path / "board.html").read_text()
     headings = re.findall("<th[^>]*>([^<]+)</th>", page.partition("</thead>")[0])
     defined = [name.partition(":")[0] for name in re.findall("<dt>([^<]+)</dt>", page)]
@@ -326,13 +337,13 @@ def test_other_pairs_are_another_table_and_one_name_stands_once(packed: Path, tm
     found = read_submission(packed)
     fewer = found.content.model_copy(update={"pairs": found.content.pairs[:1]})
     other = CheckedFile(Path("fewer.zip"), found.sha256, fewer)
-    write_leaderboard([found, other], tmp_path / "board.html", None, [0, 0])
+    write_leaderboard([found, other], tmp_path / "board.html", None)
     page = (tmp_path / "board.html").read_text()
     assert "Plan smoke, 2 pairs" in page and "Plan smoke, 1 pair<" in page
     with pytest.raises(InputError, match="two results of mine"):
-        write_leaderboard([found, found], tmp_path / "board.html", None, [0, 0])
+        write_leaderboard([found, found], tmp_path / "board.html", None)
     with pytest.raises(InputError, match=r"ends in \.html"):
-        write_leaderboard([found], tmp_path, None, [0])
+        write_leaderboard([found], tmp_path, None)
 
 
 def test_reference_rows_are_of_the_same_pairs(packed: Path, tmp_path: Path) -> None:
@@ -342,14 +353,14 @@ def test_reference_rows_are_of_the_same_pairs(packed: Path, tmp_path: Path) -> N
     (tmp_path / "report").mkdir()
     own = [pair.row for pair in found.content.pairs]  # as in the run in which the method was evaluated
     pd.DataFrame([*rows, other, *own]).to_csv(tmp_path / "report" / "results.csv", index=False)
-    write_leaderboard([found], tmp_path / "board.html", tmp_path / "report", [0])
+    write_leaderboard([found], tmp_path / "board.html", tmp_path / "report")
     page = (tmp_path / "board.html").read_text()
     assert page.count('class="reference"') == 1 and "ours" in page and "elsewhere" not in page
     assert page.index('class="reference"') < page.index('class="entry"')  # the best F1 stands first
     for pair in rows:  # false objects lower F1 and leave IoU as it is
         pair |= {"object_f1_50": -0.1, "object_iou_point": 1.0}
     pd.DataFrame(rows).to_csv(tmp_path / "report" / "results.csv", index=False)
-    write_leaderboard([found], tmp_path / "board.html", tmp_path / "report", [0])
+    write_leaderboard([found], tmp_path / "board.html", tmp_path / "report")
     page = (tmp_path / "board.html").read_text()
     assert page.index('class="reference"') > page.index('class="entry"')
 
@@ -368,10 +379,10 @@ def test_only_earlier_results_are_replaced_by_results(evaluated: RunFolder, pack
 def test_only_an_earlier_page_is_replaced_by_a_page(packed: Path, tmp_path: Path) -> None:
     found, page = read_submission(packed), tmp_path / "board.html"
     for _ in range(2):
-        write_leaderboard([found], page, None, [0])
+        write_leaderboard([found], page, None)
     (tmp_path / "mine.html").write_text("<title>my notes</title>")
     with pytest.raises(InputError, match="exists, and is no page of `tunnelcd leaderboard`"):
-        write_leaderboard([found], tmp_path / "mine.html", None, [0])
+        write_leaderboard([found], tmp_path / "mine.html", None)
     assert (tmp_path / "mine.html").read_text() == "<title>my notes</title>"
 
 
@@ -410,7 +421,7 @@ def test_a_metric_of_the_organiser_is_no_forgery(
     evaluated: RunFolder, packed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(scoring, "compute_plugin_columns", lambda *_: {"largest_object": 3.0})
-    assert score_again(read_submission(packed), evaluated) == 2
+    assert score_again(read_submission(packed), evaluated).n_checked == 2
 
 
 def test_no_submission_is_called_as_a_method_of_ours(packed: Path) -> None:
@@ -425,7 +436,7 @@ def test_no_submission_is_called_as_a_method_of_ours(packed: Path) -> None:
 
 def test_a_reference_that_was_given_the_merge_is_told(packed: Path, evaluated: RunFolder, tmp_path: Path) -> None:
     other = renamed(read_submission(packed), "theirs")
-    write_leaderboard([other], tmp_path / "b.html", evaluated.path, [0])
+    write_leaderboard([other], tmp_path / "b.html", evaluated.path)
     assert (tmp_path / "b.html").read_text().count("told the true one") == 2
 
 
