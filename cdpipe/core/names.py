@@ -10,6 +10,8 @@ LONGEST = 200  # file systems take names of 255 bytes; suffixes and the marks of
 # Names that Windows keeps for devices, with any suffix.
 _DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 _DIGEST_LENGTH = 16
+# Letters and a symbol that are drawn as nothing: fillers of Hangul, and the empty pattern of Braille.
+_BLANKS = dict.fromkeys((0x115F, 0x1160, 0x2800), " ")
 # Besides numbers, what `pandas.read_csv` takes for something else than a text.
 _NO_NAMES = ("na", "n/a", "nan", "none", "null", "true", "false", "1.#ind", "1.#qnan")
 
@@ -35,6 +37,12 @@ def path_part(name: str) -> str:
 def folded(name: str) -> str:
     """Return what two names share where they would share a folder; file systems may ignore case."""
     return path_part(name).casefold()
+
+
+def bare(name: str) -> str:
+    """Return a name without what nobody sees: spaces at its ends, format characters, marks; letters in one width."""
+    plain = unicodedata.normalize("NFKC", name).translate(_BLANKS)
+    return "".join(letter for letter in plain if unicodedata.category(letter)[0] not in "CM").strip()
 
 
 def require_name(name: str) -> str:

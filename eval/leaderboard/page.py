@@ -11,6 +11,7 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.names import bare
 from eval.core.output import made_parents, require_replaceable
 from eval.core.terminal.printing import count_pairs
 from eval.leaderboard.calls import list_merges
@@ -100,14 +101,14 @@ def write_leaderboard(files: Sequence[CheckedFile], out: Path, reference: Path |
 
 
 def _group(files: Sequence[CheckedFile]) -> list[list[CheckedFile]]:
-    """Return the submissions of the same plan and pairs together; refuse two of one name among them."""
+    """Return the submissions of the same plan and pairs together; refuse two among them whose names look alike."""
     groups: dict[tuple[Any, ...], list[CheckedFile]] = {}
     for each in files:
         pairs = frozenset((pair.scenario, pair.seed) for pair in each.content.pairs)
         groups.setdefault((each.content.plan, pairs), []).append(each)
     for group in groups.values():
-        names = [each.content.name for each in group]
-        if twice := [each for each in group if names.count(each.content.name) > 1]:
+        names = [bare(each.content.name) for each in group]
+        if twice := [each for each, name in zip(group, names, strict=True) if names.count(name) > 1]:
             told = " and ".join(str(each.path) for each in twice[:2])
             raise InputError(f"{told}: two results of {twice[0].content.name} on the same pairs: leave one out")
     return list(groups.values())

@@ -19,7 +19,7 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.names import folded, path_part, require_table_name, visible
+from cdpipe.core.names import bare, folded, path_part, require_table_name, visible
 from cdpipe.core.whole_file import whole_file
 from cdpipe.core.yamlfile import suggest
 from cdpipe.io.answer import ANSWER_FILES
@@ -191,8 +191,9 @@ def _matched(run: RunFolder, folder: Path, pairs: Sequence[Path]) -> dict[Path, 
 
 
 def is_name_of_ours(name: str) -> bool:
-    """Tell whether a preset or an oracle of tunnelcd is called so."""
-    return folded(name.partition("[")[0]) in map(folded, preset_names()) or folded(name).startswith("oracle-")
+    """Tell whether a preset or an oracle of tunnelcd is called so, or a reader of a table would take it for one."""
+    seen = bare(name)
+    return folded(seen.partition("[")[0].strip()) in map(folded, preset_names()) or folded(seen).startswith("oracle-")
 
 
 def list_predicted(run: RunFolder, name: str) -> list[Path]:

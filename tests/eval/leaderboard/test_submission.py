@@ -424,14 +424,25 @@ def test_a_metric_of_the_organiser_is_no_forgery(
     assert score_again(read_submission(packed), evaluated).n_checked == 2
 
 
-def test_no_submission_is_called_as_a_method_of_ours(packed: Path) -> None:
+@pytest.mark.parametrize(
+    "name",
+    ["tunnelcd", "tunnelcd ", "tunnelcd\u00a0", "tunnel\u200bcd", "\u3000tunnelcd", "\uff54unnelcd", "tunnelcd\ufe0f",
+     "tunnelcd [a=1]", "oracle\u00ad-mine", "Tunnelcd\u3164"],
+)  # fmt: skip
+def test_no_submission_is_called_as_a_method_of_ours(packed: Path, name: str) -> None:
     def rename(document: dict[str, Any]) -> None:
-        document["name"] = "tunnelcd"
+        document["name"] = name
         for pair in document["pairs"]:
-            pair["row"]["variant"] = "tunnelcd"
+            pair["row"]["variant"] = name
 
-    with pytest.raises(InputError, match="a preset or an oracle of tunnelcd is called tunnelcd"):
+    with pytest.raises(InputError, match="a preset or an oracle of tunnelcd is called "):
         read_submission(rewrite(packed, in_manifest(rename)))
+
+
+def test_no_two_submissions_of_one_table_look_alike(packed: Path, tmp_path: Path) -> None:
+    found = read_submission(packed)
+    with pytest.raises(InputError, match=r"two results of mine on the same pairs"):
+        write_leaderboard([found, renamed(found, "mi\u2060ne ")], tmp_path / "board.html", None)
 
 
 def test_a_reference_that_was_given_the_merge_is_told(packed: Path, evaluated: RunFolder, tmp_path: Path) -> None:
