@@ -29,6 +29,7 @@ from cdpipe.io.answer_parts import MAX_ERROR
 from eval.core.provenance import digest_file
 from eval.leaderboard.calls import digest_pair
 from eval.leaderboard.given_merge import MergeMode
+from eval.plans.worlds import world_slug
 from eval.running.cell_rows import TEXT_COLUMNS
 from eval.running.predictions import is_name_of_ours
 from eval.running.results.tables import LARGEST
@@ -157,9 +158,10 @@ def score_again(found: CheckedFile, run: RunFolder) -> CheckedFile:
         A pair that cannot be made has no answer and, as `read_submission` saw, no figure; its row stays.
 
     Raises:
-        InputError: The run lacks a pair or holds another simulation of it, or one of a pair that has no answer as it
-            cannot be made; or a row is not that of its answer.
+        InputError: The run lacks a pair, has another name for it or holds another simulation of it, or one of a pair
+            that has no answer as it cannot be made; or a row is not that of its answer.
     """
+    _require_names_of(run, found)
     pairs: list[PairPart] = []
     for pair, files in _iterate_answers(found):
         original, case = run.pair(pair.scenario, pair.seed), f"{pair.scenario} {pair.seed}"
@@ -189,6 +191,15 @@ def score_again(found: CheckedFile, run: RunFolder) -> CheckedFile:
     return replace(found, content=found.content.model_copy(update={"pairs": pairs}), n_checked=n_scored)
 
 
+def _require_names_of(run: RunFolder, found: CheckedFile) -> None:
+    """Refuse other names of worlds than the run has for them: they lead to one folder, and stand apart in tables."""
+    for pair in {pair.scenario: pair for pair in found.content.pairs}.values():
+        row = run.any_row(world_slug(pair.scenario))
+        if row is not None and row["scenario"] != pair.scenario:
+            told = f"{found.path}: {visible(pair.scenario)} {pair.seed}"
+            raise InputError(f"{told}: is called {visible(row['scenario'])} in {run.path}: evaluate the same plan")
+
+
 def _iterate_answers(found: CheckedFile) -> Iterator[tuple[PairPart, dict[str, bytes]]]:
     """Yield each pair and the content of the files of its answer."""
     with opened_zip(found.path, found.path.stat().st_size, _EXPECTED) as (archive, members):
@@ -209,8 +220,9 @@ def check_rows(document: Submission) -> None:
         )
     seen = set()
     for pair in document.pairs:
-        case = pair.scenario, pair.seed
-        if case in seen or (pair.row.get("scenario"), pair.row.get("seed")) != case:
+        # two names of a world may lead to one folder of pairs
+        case = world_slug(pair.scenario).casefold(), pair.seed
+        if case in seen or (pair.row.get("scenario"), pair.row.get("seed")) != (pair.scenario, pair.seed):
             raise ValueError(f"the row of {visible(pair.scenario)} {pair.seed} stands twice, or is of another pair")
         seen.add(case)
         if pair.row.get("variant") != document.name or pair.row.get("metrics_version") != METRICS_VERSION:

@@ -229,6 +229,34 @@ def test_the_page_is_made_of_the_rows_that_were_scored_again(evaluated: RunFolde
         score_again(read_submission(rewrite(packed, in_row(domain="in"))), evaluated)
 
 
+def as_pair(number: int, source: int, scenario: str) -> Change:
+    """Hand in the row and the answer of a pair once more, under another name of it, in the place of another pair."""
+
+    def whole(members: dict[str, bytes]) -> None:
+        def change(document: dict[str, Any]) -> None:
+            pair = json.loads(json.dumps(document["pairs"][source]))
+            pair["scenario"] = pair["row"]["scenario"] = scenario
+            document["pairs"][number] = pair
+
+        in_manifest(change)(members)
+        for file in ("answer.json", "answer.npz"):
+            members[f"answers/{number:05d}/{file}"] = members[f"answers/{source:05d}/{file}"]
+
+    return whole
+
+
+@pytest.mark.parametrize("alias", ["smoke__one_box", "smoke/one box", "smoke/One_box"])
+def test_no_easy_pair_counts_twice_under_another_name(packed: Path, alias: str) -> None:
+    with pytest.raises(InputError, match="stands twice"):
+        read_submission(rewrite(packed, as_pair(1, 0, alias)))
+
+
+def test_pairs_are_called_as_in_the_run_that_scores_them(evaluated: RunFolder, packed: Path) -> None:
+    found = read_submission(rewrite(packed, as_pair(0, 0, "smoke__one_box")))
+    with pytest.raises(InputError, match="smoke__one_box 20000: is called smoke/one_box in "):
+        score_again(found, evaluated)
+
+
 @pytest.mark.parametrize(
     "claim",
     [{"object_iou_point": float("nan")}, {"false_regions_per_100m": None}, {"t_total_s": 0.0}, {"n_objects": 99}],
