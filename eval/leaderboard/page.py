@@ -31,6 +31,7 @@ from eval.leaderboard.reference import find_reference
 from eval.leaderboard.submission import CheckedFile
 from eval.plans.files import plan_names
 from eval.plans.plan import load_plan
+from eval.plans.splits import find_split
 from eval.report.render import render_page, write_file
 from eval.running.results.run_data import RunData
 
@@ -133,10 +134,18 @@ def _make_boards(group: Sequence[CheckedFile], reference: Path | None) -> Iterat
             f"Plan {first.plan}",
             *([part] if part else []),
             count_pairs(len(pairs)),
-            *([first.split] if first.split else []),
+            *_tell_split(group),
         ]
         notes = _notes(group, data, len(pairs), rows) if part == [*parts][-1] else ()
         yield Board(", ".join(told), tuple(_line(*row) for row in rows), tuple(notes))
+
+
+def _tell_split(group: Sequence[CheckedFile]) -> Iterator[str]:
+    """Yield the split that the seeds are of; nothing for the split for development, which plans name."""
+    seeds = [pair.seed for pair in group[0].content.pairs]
+    split = find_split(seeds, [each.content.split for each in group])
+    if split != "dev":
+        yield split or f"seeds {min(seeds)} to {max(seeds)} of no split"
 
 
 def take_rows(each: CheckedFile) -> pd.DataFrame:
@@ -151,7 +160,9 @@ def _line(row: dict[str, Any], merge: str, is_reference: bool) -> Line:
     figures = [
         Shown(show_figure(key, row[key]), show_span(key, row[f"{key}_low"], row[f"{key}_high"])) for key in FIGURES
     ]
-    return Line((Shown(row["method"]), Shown(merge), answered, *figures), is_reference)
+    # what a reference was given stands in its run; nothing tells what a program of others had
+    told = Shown(merge, "" if is_reference else "the sender's word")
+    return Line((Shown(row["method"]), told, answered, *figures), is_reference)
 
 
 def _notes(

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated
@@ -66,6 +67,27 @@ def sealed_by(split: str) -> str:
     if _numbers_of(version) > _numbers_of(running):
         raise InputError(f"--split {split}: this is {running}: expected it or an earlier one")
     return version
+
+
+def find_split(seeds: Sequence[int], claimed: Iterable[str] = ()) -> str:
+    """Return the split of the test seeds that some seeds are of, worked out from their numbers.
+
+    Args:
+        seeds: The seeds.
+        claimed: What senders call the split, as `Plan.split`; a version is tried if it is this one or an earlier one.
+
+    Returns:
+        "dev"; "sealed by " and the version from whose name all are drawn; "" if they are of none of these.
+    """
+    dev = load_splits().dev
+    if all(dev.first <= seed < dev.end for seed in seeds):
+        return "dev"
+    versions = [version_name()]
+    for name in claimed:
+        with suppress(InputError):
+            versions.append(sealed_by(f"sealed:{name.removeprefix('sealed by tunnelcd ')}"))
+    every = range(dev.first, dev.end)
+    return next((f"sealed by {each}" for each in versions if set(seeds) <= set(seal_seeds(every, each))), "")
 
 
 def _numbers_of(version: str) -> list[int]:

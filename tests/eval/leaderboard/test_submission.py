@@ -20,6 +20,7 @@ from eval.leaderboard.calls import digest_method, read_evaluation
 from eval.leaderboard.packing import pack_submission
 from eval.leaderboard.page import take_rows, write_leaderboard
 from eval.leaderboard.submission import CheckedFile, read_submission, score_again
+from eval.plans.splits import seal_seeds, version_name
 from eval.running.runfolder import RunFolder, write_json
 from eval.scoring import scoring
 
@@ -349,6 +350,38 @@ def test_the_page_shows_every_file_escaped(packed: Path, tmp_path: Path) -> None
     assert 'placeholder = "Filter rows"' in page and "<button" not in page  # tables as those of a report
     assert "2 of 2 pairs" in page and "0 of 2 pairs" in page and found.sha256 in page
     assert "http" not in page.replace("http-equiv", "")
+
+
+@pytest.mark.parametrize(
+    ("seeds", "claimed", "told"),
+    [
+        ((20000, 20999), "sealed by tunnelcd 0.3.0", ""),
+        (seal_seeds((20000, 20005), "tunnelcd 0.2.0"), "sealed by tunnelcd 0.2.0", ", sealed by tunnelcd 0.2.0"),
+        (seal_seeds((20000, 20005), version_name()), "", f", sealed by {version_name()}"),
+        (seal_seeds((20000, 20005), "tunnelcd 0.2.0"), "sealed by tunnelcd 0.1.0", ", seeds {} to {} of no split"),
+        ((40000, 40001), "sealed by tunnelcd 99.0.0", ", seeds {} to {} of no split"),
+        ((40000, 40001), "sealed by <b>", ", seeds {} to {} of no split"),
+        ((10000, 10001), "", ", seeds {} to {} of no split"),
+    ],
+)
+def test_the_split_is_that_of_the_seeds_whatever_is_claimed(
+    packed: Path, tmp_path: Path, seeds: tuple[int, int], claimed: str, told: str
+) -> None:
+    found = read_submission(packed)
+    pairs = [
+        pair.model_copy(update={"seed": seed, "row": {**pair.row, "seed": seed}})
+        for pair, seed in zip(found.content.pairs, seeds, strict=True)
+    ]
+    content = found.content.model_copy(update={"pairs": pairs, "split": claimed})
+    write_leaderboard([replace(found, content=content)], tmp_path / "board.html", None)
+    page = (tmp_path / "board.html").read_text()
+    assert f">Plan smoke, 2 pairs{told.format(*sorted(seeds))}</h2>" in page
+
+
+def test_the_merge_is_the_senders_word(packed: Path, tmp_path: Path) -> None:
+    write_leaderboard([read_submission(packed)], tmp_path / "board.html", None)
+    (row,) = re.findall(r'<tr class="entry">.*?</tr>', (tmp_path / "board.html").read_text(), re.DOTALL)
+    assert 'told the true one<span class="interval">the sender' in row
 
 
 def test_every_heading_of_the_leaderboard_is_defined_under_the_name_that_it_has_there(
