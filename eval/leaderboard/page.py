@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,12 @@ from eval.report.render import render_page, write_file
 from eval.running.results.run_data import RunData
 
 _HEAD = b"<title>tunnelcd: leaderboard</title>"
+_F1 = replace(
+    SHOWN["object_f1_50"],
+    meaning=SHOWN["object_f1_50"].meaning + " Of a pair in which nothing changed: 1 if the answer has no region and no "
+    "object, 0 if it has one or there is none.",
+    when_undefined="",
+)
 _MERGES = {"own": "its own", "given": "told the true one", "ours": "told tunnelcd's"}
 
 
@@ -94,7 +100,7 @@ def write_leaderboard(files: Sequence[CheckedFile], out: Path, reference: Path |
          "version": each.content.versions.get("tunnelcd", "")}
         for each in files
     ]  # fmt: skip
-    columns = [(heading, SHOWN[key]) for key, heading in HEADINGS.items()]
+    columns = [(heading, _F1 if key == _F1.key else SHOWN[key]) for key, heading in HEADINGS.items()]
     headings = ("method", "merge", "pairs", *HEADINGS.values())
     content = {"boards": boards, "headings": headings, "files": told, "columns": columns}
     with made_parents(out):
@@ -119,7 +125,7 @@ def _make_boards(group: Sequence[CheckedFile], reference: Path | None) -> Iterat
     """Yield a table for each kind of pairs (`part_pairs`); the notes stand below the last."""
     first = group[0].content
     data = find_reference(first.plan, reference)
-    own = {each.content.name: take_figures(take_rows(each)) for each in group}
+    own = {each.content.name: count_silence(take_figures(take_rows(each))) for each in group}
     merges = {} if data is None else {name: _MERGES[merge] for name, merge in list_merges(data.folder).items()}
     parts = part_pairs(own[first.name])
     for part, pairs in parts.items():
@@ -127,7 +133,7 @@ def _make_boards(group: Sequence[CheckedFile], reference: Path | None) -> Iterat
                 for (name, found), each in zip(own.items(), group, strict=True)]  # fmt: skip
         # a run in which a method was evaluated holds its rows, too
         variants = list_variants([] if data is None else [data], pairs)
-        references = [(name, found) for name, found in variants if name not in own]
+        references = [(name, count_silence(found)) for name, found in variants if name not in own]
         rows += [(summarise_figures(name, found), merges.get(name, ""), True) for name, found in references]
         rows.sort(key=lambda row: _place(row[0]))
         told = [
@@ -138,6 +144,16 @@ def _make_boards(group: Sequence[CheckedFile], reference: Path | None) -> Iterat
         ]
         notes = _notes(group, data, len(pairs), rows) if part == [*parts][-1] else ()
         yield Board(", ".join(told), tuple(_line(*row) for row in rows), tuple(notes))
+
+
+def count_silence(figures: pd.DataFrame) -> pd.DataFrame:
+    """Let each pair in which nothing changed count in F1: 1 where the answer is silent, 0 where it counts as an alarm.
+
+    F1 is undefined there: without it, who calls something a change on every pair has the place of who does not. A
+    refusal that may be right is neither.
+    """
+    silence = 1.0 - figures["is_alarm"]
+    return figures.assign(object_f1_50=figures["object_f1_50"].where(silence.isna(), silence))
 
 
 def _tell_split(group: Sequence[CheckedFile]) -> Iterator[str]:
@@ -187,10 +203,7 @@ def _notes(
 
 
 def _place(row: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return what sorts the best first: F1, which false objects lower, then the others.
-
-    Where nothing changed these are NaN, and alarms decide; a refused pair counts as one.
-    """
+    """Return what sorts the best first: F1 (`count_silence`), which false objects and alarms lower, then the others."""
     high = (row["object_f1_50"], row["object_iou_point"], row["region_recall"])
     order = (*(-value for value in high), row["is_alarm"], row["false_regions_per_100m"])
     return tuple(math.inf if math.isnan(value) else value for value in order)

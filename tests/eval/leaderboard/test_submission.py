@@ -25,6 +25,7 @@ from eval.running.runfolder import RunFolder, write_json
 from eval.scoring import scoring
 
 ONE_BOX = "smoke/one_box"
+NAN = float("nan")
 Change = Callable[[dict[str, bytes]], None]
 
 
@@ -424,6 +425,45 @@ def test_reference_rows_are_of_the_same_pairs(packed: Path, tmp_path: Path) -> N
     write_leaderboard([found], tmp_path / "board.html", tmp_path / "report")
     page = (tmp_path / "board.html").read_text()
     assert page.index('class="reference"') > page.index('class="entry"')
+
+
+def with_rows(found: CheckedFile, name: str, *rows: dict[str, Any]) -> CheckedFile:
+    """Return a submission under another name with other figures."""
+    other = renamed(found, name).content
+    pairs = [pair.model_copy(update={"row": {**pair.row, **row}}) for pair, row in zip(other.pairs, rows, strict=True)]
+    return replace(found, content=other.model_copy(update={"pairs": pairs}))
+
+
+def test_a_place_is_earned_by_silence_where_nothing_changed(packed: Path, tmp_path: Path) -> None:
+    # both find the box; one calls something a change on every pair, with regions, with objects, or by no answer
+    changed = {"object_f1_50": 0.8, "is_unchanged_pair": False, "is_alarm": None, "n_objects": 1, "status": "ok"}
+    better, unchanged = {**changed, "object_f1_50": 0.9}, {"object_f1_50": NAN, "is_unchanged_pair": True}
+    loud = (
+        {**unchanged, "is_alarm": True, "n_objects": 0},
+        {**unchanged, "is_alarm": False, "n_objects": 1},
+        {**unchanged, "is_alarm": None, "n_objects": None, "status": "failed"},
+    )
+    found = read_submission(packed)
+    for each in loud:
+        silent = with_rows(found, "silent", changed, {**unchanged, "is_alarm": False, "n_objects": 0})
+        write_leaderboard([with_rows(found, "loud", better, each), silent], tmp_path / "board.html", None)
+        page = (tmp_path / "board.html").read_text()
+        rows = re.findall(r'<tr class="entry">(.*?)</tr>', page, re.DOTALL)
+        cells = [re.findall(r"<td>([^<]*)", row) for row in rows]
+        place = re.findall("<th[^>]*>([^<]+)</th>", page).index("F1 at 0.5")
+        assert [(row[0], row[place]) for row in cells] == [("silent", "0.90"), ("loud", "0.45")]
+
+
+def test_reference_rows_earn_their_place_by_silence_too(packed: Path, tmp_path: Path) -> None:
+    found = read_submission(packed)
+    rows = [{**pair.row, "variant": "ours", "n_objects": 0, "is_unchanged_pair": index == 1, "is_alarm": False,
+             "object_f1_50": 0.5 if index == 0 else NAN} for index, pair in enumerate(found.content.pairs)]  # fmt: skip
+    rows[0]["is_alarm"] = NAN
+    (tmp_path / "report").mkdir()
+    pd.DataFrame(rows).to_csv(tmp_path / "report" / "results.csv", index=False)
+    write_leaderboard([found], tmp_path / "board.html", tmp_path / "report")
+    (row,) = re.findall(r'<tr class="reference">.*?</tr>', (tmp_path / "board.html").read_text(), re.DOTALL)
+    assert "<td>0.75" in row
 
 
 def test_only_earlier_results_are_replaced_by_results(evaluated: RunFolder, packed: Path, tmp_path: Path) -> None:
