@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.names import bare
+from cdpipe.core.names import bare, visible
 from eval.core.output import made_parents, require_replaceable
 from eval.core.terminal.printing import count_pairs
 from eval.leaderboard.calls import list_merges
@@ -34,6 +34,7 @@ from eval.plans.plan import load_plan
 from eval.plans.splits import find_split
 from eval.report.render import render_page, write_file
 from eval.running.results.run_data import RunData
+from eval.tables.rows import PAIR, with_pair
 
 _HEAD = b"<title>tunnelcd: leaderboard</title>"
 _F1 = replace(
@@ -93,7 +94,11 @@ def write_leaderboard(files: Sequence[CheckedFile], out: Path, reference: Path |
         InputError: Two submissions are of one method on the same pairs, or a file cannot be read or written.
     """
     require_page(out)
-    boards = [board for group in _group(files) for board in _make_boards(group, reference)]
+    boards = []
+    for group in _group(files):
+        data = find_reference(group[0].content.plan, reference)
+        _refuse_unmade(group, files, data)
+        boards += _make_boards(group, data)
     told = [
         {"name": each.content.name, "file": each.path.name, "sha256": each.sha256, "content": each.content,
          "command": " ".join(each.content.command), "n_checked": each.n_checked,
@@ -121,10 +126,25 @@ def _group(files: Sequence[CheckedFile]) -> list[list[CheckedFile]]:
     return list(groups.values())
 
 
-def _make_boards(group: Sequence[CheckedFile], reference: Path | None) -> Iterator[Board]:
+def _refuse_unmade(group: Sequence[CheckedFile], files: Sequence[CheckedFile], data: RunData | None) -> None:
+    """Refuse a pair without an answer, as one that cannot be made, that another file or the reference answers."""
+    rows = () if data is None else with_pair(pd.DataFrame(list(data.results)))[PAIR].itertuples(index=False, name=None)
+    made = dict.fromkeys(rows, "" if data is None else data.folder.path.name)
+    for each in files:
+        if each.content.plan == group[0].content.plan:
+            made |= {(pair.scenario, pair.seed): each.path.name for pair in each.content.pairs if pair.pair_digest}
+    for each in group:
+        for pair in each.content.pairs:
+            if not pair.files and (other := made.get((pair.scenario, pair.seed))):
+                raise InputError(
+                    f"{each.path}: {visible(pair.scenario)} {pair.seed}: no answer, as a pair that cannot be made; "
+                    f"{other} has it: leave the file out, or evaluate and submit again"
+                )
+
+
+def _make_boards(group: Sequence[CheckedFile], data: RunData | None) -> Iterator[Board]:
     """Yield a table for each kind of pairs (`part_pairs`); the notes stand below the last."""
     first = group[0].content
-    data = find_reference(first.plan, reference)
     own = {each.content.name: count_silence(take_figures(take_rows(each))) for each in group}
     merges = {} if data is None else {name: _MERGES[merge] for name, merge in list_merges(data.folder).items()}
     parts = part_pairs(own[first.name])

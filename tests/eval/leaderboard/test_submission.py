@@ -318,6 +318,25 @@ def test_a_pair_that_was_made_has_an_answer(packed: Path) -> None:
         read_submission(rewrite(packed, change))
 
 
+def test_a_pair_that_others_made_can_be_made(evaluated: RunFolder, packed: Path, tmp_path: Path) -> None:
+    made = renamed(read_submission(packed), "theirs")
+    unmade = read_submission(rewrite(packed, without_answer()))
+    fewer = replace(made, content=made.content.model_copy(update={"pairs": made.content.pairs[:1]}))
+    told = "smoke/one_box 20000: no answer, as a pair that cannot be made; "
+    for other in (made, fewer):
+        with pytest.raises(InputError, match=rf"changed\.zip: {told}.*mine\.zip has it: leave the file out"):
+            write_leaderboard([other, unmade], tmp_path / "board.html", None)
+    # so have reference rows of a pair, unless it could not be made there either
+    rows = [{**pair.row, "variant": "ours"} for pair in made.content.pairs]
+    (tmp_path / "report").mkdir()
+    pd.DataFrame(rows).to_csv(tmp_path / "report" / "results.csv", index=False)
+    with pytest.raises(InputError, match=rf"changed\.zip: {told}report has it: leave the file out"):
+        write_leaderboard([unmade], tmp_path / "board.html", tmp_path / "report")
+    rows[0] = {**unmade.content.pairs[0].row, "variant": "ours"}
+    pd.DataFrame(rows).to_csv(tmp_path / "report" / "results.csv", index=False)
+    write_leaderboard([unmade], tmp_path / "board.html", tmp_path / "report")
+
+
 def test_folders_are_left_out_of_the_packed_command(run: RunFolder, tmp_path: Path) -> None:
     words = ["/usr/bin/python", "/home/me/a=b/m.py", "--w=/home/me/w.pt", "--n=3", "{out}"]
     path = run.path / "evaluations" / "mine" / "evaluation.json"
