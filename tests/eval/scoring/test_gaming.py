@@ -148,6 +148,26 @@ def test_spheres_everywhere_cost_precision_and_false_regions(tiny_pair: Path, ho
     assert row["false_regions_per_100m"] > 10
 
 
+def test_regions_around_a_false_one_are_false_and_those_around_a_true_one_take_places(
+    tiny_pair: Path, honest: ChangeReport
+) -> None:
+    regions, radius_m = honest.regions, load_ground_truth(tiny_pair).pair.score_radius_m
+    beside = np.array([[-0.9 * radius_m, 0.0, 0.0], [0.0, 0.0, 0.0], [0.9 * radius_m, 0.0, 0.0]])
+    n = 3 * len(regions.scores)
+    more = replace(
+        regions,
+        centres_map=(regions.centres_map[:, None] + beside).reshape(-1, 3),
+        scores=np.repeat(regions.scores, 3),
+        pairs=np.zeros((n, 2), np.int64),
+        is_reported=np.ones(n, np.bool_),
+    )
+    objects = tuple(replace(item, region=-1) for item in honest.objects)
+    whole = scored(tiny_pair, honest).row
+    row = scored(tiny_pair, replace(honest, regions=more, objects=objects, figures={})).row
+    assert row["n_false_regions"] == 3 * whole["n_false_regions"] == 3
+    assert row["region_recall_at_k"] <= whole["region_recall_at_k"]
+
+
 def test_a_tiny_radius_moves_the_coverage_alone(tiny_pair: Path, honest: ChangeReport) -> None:
     row = scored(tiny_pair, honest).row
     tiny = scored(tiny_pair, replace(honest, regions=replace(honest.regions, radius_m=1e-9))).row
