@@ -94,7 +94,7 @@ def write_leaderboard(files: Sequence[CheckedFile], out: Path, reference: Path |
         InputError: Two submissions are of one method on the same pairs, or a file cannot be read or written.
     """
     require_page(out)
-    boards = []
+    boards: list[Board] = []
     for group in _group(files):
         data = find_reference(group[0].content.plan, reference)
         _refuse_unmade(group, files, data)

@@ -21,7 +21,7 @@ from eval.core.statistics import ENOUGH_PAIRS
 from eval.core.terminal.printing import count_pairs
 from eval.report.comparing.columns import COMPARED
 from eval.report.comparing.differences import is_told_apart
-from eval.report.objects.tables import OBJECT_COLUMNS
+from eval.report.objects.tables import OBJECT_COLUMNS, OBJECT_COUNTS
 from eval.report.regions.regions import REGION_COLUMNS
 from eval.report.summary import means_by_method
 from eval.report.tables import Table, methods_table
@@ -41,8 +41,8 @@ _LATEX = {
 }  # fmt: skip
 (_KEPT,) = select(COMPARED, "bytes_regions_before")
 SUMMARY_COLUMNS = (*RESULT_COLUMNS, replace(_KEPT, heading="kept [kB]"))
-_SUBJECTS = {"regions_table": ("Finding the changed places", REGION_COLUMNS),
-             "objects_table": ("Cutting out the objects", OBJECT_COLUMNS)}  # fmt: skip
+_SUBJECTS = {"regions_table": ("Finding the changed places", REGION_COLUMNS, {}),
+             "objects_table": ("Cutting out the objects", OBJECT_COLUMNS, OBJECT_COUNTS)}  # fmt: skip
 
 
 def latex_tables(data: RunData) -> dict[str, str]:
@@ -59,10 +59,10 @@ def latex_tables(data: RunData) -> dict[str, str]:
         words = "Every method over all its session pairs, times as medians, the rest as means"
         table = means_by_method(cases, SUMMARY_COLUMNS)
         found["summary.tex"] = _float(data, "summary", words, table, SUMMARY_COLUMNS, cases)
-    for name, (subject, columns) in _SUBJECTS.items():
+    for name, (subject, columns, counts) in _SUBJECTS.items():
         table = off_grids(stored_table(data, name), data)
         if len(table):
-            found[f"{name}.tex"] = _float(data, name, subject, table, columns, every)
+            found[f"{name}.tex"] = _float(data, name, subject, table, columns, every, counts)
     return found
 
 
@@ -77,14 +77,21 @@ def to_latex(table: Table) -> str:
 
 
 def _float(
-    data: RunData, name: str, words: str, table: pd.DataFrame, columns: Sequence[Column], cases: pd.DataFrame
+    data: RunData,
+    name: str,
+    words: str,
+    table: pd.DataFrame,
+    columns: Sequence[Column],
+    cases: pd.DataFrame,
+    counts: Mapping[str, str] | None = None,
 ) -> str:
     """Return one `table*`: a line of values for each method and, where there are intervals, a small one below it."""
     shown = [column for column in columns if column.key in table and table[column.key].notna().any()]
     lines: list[list[str]] = []
     untested: set[str] = set()
     domains = table.groupby("domain", sort=False)
-    for (domain, own), (group, rows) in zip(domains, methods_table(table, shown, cases).groups(), strict=True):
+    groups = methods_table(table, shown, cases, counts=counts).groups()
+    for (domain, own), (group, rows) in zip(domains, groups, strict=True):
         of_domain = cases if domain == ALL_DOMAINS else cases[cases["domain"] == domain]
         of_method = {str(name): part.set_index(PAIR).sort_index() for name, part in of_domain.groupby("variant")}
         marks = [

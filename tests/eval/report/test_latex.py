@@ -142,6 +142,20 @@ def test_stored_tables_keep_their_numbers_and_name_what_is_not_tested(tmp_path: 
     assert "precision" in untested[1]
 
 
+def test_the_few_objects_that_one_matched_make_no_best_and_their_number_stands_below(tmp_path: Path) -> None:
+    stored = [
+        {"domain": "in", "variant": name, "n_pairs": 6, "n_changes": 12, "kind_accuracy": kind, "n_matched": n}
+        for name, kind, n in (("good", 0.9, 9), ("lesser", 0.5, 9), ("surest", 1.0, 7))
+    ]
+    pd.DataFrame(stored).to_csv(tmp_path / "objects_table.csv", index=False)
+    source = latex_tables(run(tmp_path, {name: [0.9] * 6 for name in ("good", "lesser", "surest")}))[
+        "objects_table.tex"
+    ]
+    found = {name: line_of(source, name)[-1] for name in ("good", "lesser", "surest")}
+    assert [name for name, cell in found.items() if "textbf" in cell] == []
+    assert "n 7" in source and "n 9" in source
+
+
 @pytest.mark.parametrize("word", ["regions_table", "objects_table"])
 def test_a_run_without_a_table_has_no_source_for_it(tmp_path: Path, word: str) -> None:
     assert f"{word}.tex" not in latex_tables(run(tmp_path, {"a": [1.0]}))
