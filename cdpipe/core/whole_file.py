@@ -1,16 +1,23 @@
-"""Output files that are complete or absent."""
+"""Output files that are complete or absent, and the hidden folders in which others are begun."""
 
 from __future__ import annotations
 
 import errno
 import os
+import shutil
+import stat
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import path_part
 
+if sys.platform != "win32":
+    import fcntl
+
+_FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LONGEST_BYTES = 255  # of a name, which file systems take
 
 
@@ -32,8 +39,19 @@ def whole_file(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)  # it may be a link, which a writer would follow
         yield partial
         partial.replace(path)
+    except OSError as error:
+        if error.filename == str(partial):
+            error.filename = str(path)
+        name_full_disk(error, path)
+        raise
     finally:
         partial.unlink(missing_ok=True)
+
+
+def name_full_disk(error: OSError, path: Path) -> None:
+    """Give the error of a full disk the name of the output, where the system tells none."""
+    if error.filename is None and error.errno in _FULL_DISK:
+        error.filename = str(path)
 
 
 def partial_of(path: Path) -> Path:
@@ -46,3 +64,96 @@ def partial_of(path: Path) -> Path:
         raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG), str(path))
     name = f".{path.name}.partial"
     return path.with_name(name if len(os.fsencode(name)) <= _LONGEST_BYTES else f".{path_part(path.name)}.partial")
+
+
+@contextmanager
+def hidden_folder(path: Path, called: Path | None = None) -> Iterator[Path]:
+    """Hold an empty hidden folder beside `path` for the block, which may rename it; else it is removed at the end.
+
+    What a killed process left there is removed. Folders above it are made.
+
+    Args:
+        path: The output.
+        called: What messages call it; left out: `path`.
+
+    Raises:
+        InputError: Another process holds it.
+        OSError: It cannot be made, or its name is another's.
+    """
+    partial = partial_of(path)
+    try:
+        handle = _claim(partial)
+    except BlockingIOError as error:
+        raise InputError(
+            f"{called or path}: another `tunnelcd` writes there: wait until it ends, or name another"
+        ) from error
+    try:
+        for child in list(os.scandir(partial)):
+            if child.is_dir(follow_symlinks=False):
+                shutil.rmtree(child.path)
+            else:
+                Path(child.path).unlink()
+        yield partial
+    finally:
+        if _is_held(
+            handle, partial
+        ):  # a folder that was renamed has its own name; there may be the next one of another
+            shutil.rmtree(partial, ignore_errors=True)
+        if handle is not None:
+            os.close(handle)
+
+
+def hold(folder: Path) -> int | None:
+    """Hold a folder against other processes that ask for it, until the handle is closed or this process dies.
+
+    Returns:
+        The handle; None on a system without such locks. Some network disks hold no locks, and exclude nobody.
+
+    Raises:
+        BlockingIOError: Another process holds it.
+        OSError: There is no such folder, or it cannot be read.
+    """
+    if sys.platform == "win32":
+        return None
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise
+    except OSError:
+        pass
+    return handle
+
+
+def _claim(partial: Path) -> int | None:
+    """Hold the hidden folder of that name; make it unless it is there."""
+    partial.parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        try:
+            partial.mkdir()
+        except FileExistsError:
+            if partial.is_symlink() or partial.is_file():
+                raise
+        except KeyboardInterrupt:
+            with suppress(OSError):
+                partial.rmdir()
+            raise
+        try:
+            handle = hold(partial)
+        except FileNotFoundError:
+            continue
+        if _is_held(handle, partial):
+            return handle
+        # meanwhile its holder has renamed or removed it, and a lock on that excludes nobody
+        if handle is not None:
+            os.close(handle)
+
+
+def _is_held(handle: int | None, folder: Path) -> bool:
+    """Return whether a handle is still that of the folder of this name; without a handle, whether there is one."""
+    try:
+        found = folder.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode) and (handle is None or os.path.samestat(os.fstat(handle), found))

@@ -14,9 +14,8 @@ revolution, from the session's own odometry. A session is written under a tempor
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -29,6 +28,7 @@ from pydantic import ConfigDict, Field, field_validator
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import ArraySpec, read_json, read_npz, require_format
 from cdpipe.core.geometry import Float32Array, Float64Array, Int64Array, require_poses, require_shape, require_shapes
+from cdpipe.core.whole_file import hidden_folder
 from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.sensor.ouster import SensorMetadata, parse_metadata
 
@@ -141,6 +141,7 @@ class SessionWriter:
             raise InputError(f"{path} exists already: name a new folder or remove it")
         self._path = path
         self._partial = path.with_name(f".{path.name}.partial")
+        self._held = ExitStack()
         self._sensor = sensor
         self._chunk_scans = chunk_scans
         self._provenance = provenance
@@ -148,16 +149,16 @@ class SessionWriter:
         self._n_chunks = 0
 
     def __enter__(self) -> SessionWriter:
-        shutil.rmtree(self._partial, ignore_errors=True)
-        with self._writing():
-            (self._partial / "chunks").mkdir(parents=True)
+        with self._writing(), ExitStack() as stack:
+            self._partial = stack.enter_context(hidden_folder(self._path))
+            (self._partial / "chunks").mkdir()
+            self._held = stack.pop_all()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None:
-            shutil.rmtree(self._partial, ignore_errors=True)
+        self._held.close()
 
     @property
     def folder(self) -> Path:

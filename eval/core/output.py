@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.names import visible
-from cdpipe.core.whole_file import partial_of
-
-if sys.platform != "win32":
-    import fcntl
+from cdpipe.core.whole_file import hidden_folder, hold, name_full_disk
 
 _HEAD_BYTES = 1024
 
@@ -25,37 +21,30 @@ def new_folder(path: Path) -> Iterator[Path]:
     """Yield a hidden empty folder that becomes `path` when the block succeeds, and is removed when it fails.
 
     Raises:
-        InputError: `path` is a file or a folder with something in it, or cannot be made.
+        InputError: `path` is a file or a folder with something in it, cannot be made, or is being written by another.
     """
     made: list[Path] = []
-    partial: Path | None = None
     try:
-        # a link to an empty folder, or to none yet, is that folder
-        path = Path(os.path.realpath(path)) if path.is_symlink() else path.absolute()
-        if path.is_symlink():
-            raise InputError(f"{path}: is a link that leads to itself: name a folder you may write to")
-        hidden = partial_of(path)
-        made = _missing_parents(path)
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            what = "is not empty" if path.is_dir() else "is a file"
-            raise InputError(f"{path}: {what}: name a new or empty folder for the output")
-        partial = hidden
-        _start(partial)
-        if path.exists():
-            _write_nothing(path)
-    except BaseException as error:
-        _clear(partial, made)
-        if isinstance(error, OSError):
-            raise unwritable(path, error) from error
-        raise
-    try:
-        yield partial
-        if path.exists():
-            path.rmdir()
-        partial.replace(path)
-    except BaseException as error:
-        _clear(partial, made)
-        _name_output(error, partial, path)
+        with ExitStack() as stack:
+            with _told_as(path):
+                # a link to an empty folder, or to none yet, is that folder
+                home = Path(os.path.realpath(path)) if path.is_symlink() else path.absolute()
+                if home.is_symlink():
+                    raise InputError(f"{path}: is a link that leads to itself: name a folder you may write to")
+                made = _missing_parents(home)
+                _require_empty(home, path)
+                partial = stack.enter_context(hidden_folder(home, path))
+                _require_empty(home, path)  # another may have written it until now
+                if home.exists():
+                    _write_nothing(home)
+            with _naming(path, partial):
+                yield partial
+            with _told_as(path):
+                if home.exists():
+                    home.rmdir()
+                partial.replace(home)
+    except BaseException:
+        _remove_empty(made)
         raise
 
 
@@ -66,32 +55,19 @@ def new_files(*paths: Path) -> Iterator[Path]:
     The folder is removed. When the block fails, nothing else is left either.
 
     Raises:
-        InputError: A path exists, or they cannot be made. They lie in one folder.
+        InputError: A path exists, or they cannot be made, or are being written by another. They lie in one folder.
     """
-    for path in paths:
-        try:
-            is_there = path.exists() or path.is_symlink()
-        except OSError as error:
-            raise unwritable(path, error) from error
-        if is_there:
-            raise InputError(f"{path} exists already: name a new file or remove it")
+    _require_new(paths)
     first = paths[0].absolute()
-    with made_parents(first):
-        partial: Path | None = None
-        try:
-            try:
-                partial = partial_of(first)
-                _start(partial)
-            except OSError as error:
-                raise unwritable(first, error) from error
+    with made_parents(first), ExitStack() as stack:
+        with _told_as(first):
+            partial = stack.enter_context(hidden_folder(first, paths[0]))
+        _require_new(paths)
+        with _naming(first.parent if len(paths) > 1 else first, partial, first.parent):
             yield partial
+        with _told_as(first):
             for path in paths:
                 (partial / path.name).replace(path)
-        except InputError as error:
-            _name_output(error, partial, first.parent)
-            raise
-        finally:
-            _clear(partial, [])
 
 
 @contextmanager
@@ -135,21 +111,15 @@ def only_writer(folder: Path, command: str) -> Iterator[None]:
     Raises:
         InputError: Another process holds it.
     """
-    if sys.platform == "win32":
-        yield
-        return
-    handle = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        handle = hold(folder)
     except BlockingIOError as error:
-        os.close(handle)
         raise InputError(f"{folder}: another `{command}` writes there: wait until it ends, or name another") from error
-    except OSError:
-        pass  # some network disks hold no locks
     try:
         yield
     finally:
-        os.close(handle)
+        if handle is not None:
+            os.close(handle)
 
 
 def copy_folder(source: Path, target: Path, copy: Callable[[str, str], object] = shutil.copy2) -> None:
@@ -227,35 +197,55 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _name_output(error: BaseException, partial: Path | None, path: Path) -> None:
-    """Let the line of a mistake name the output, and not the hidden folder in which it was begun."""
-    if partial is None:
-        return
-    if isinstance(error, InputError):
-        error.args = tuple(str(told).replace(str(partial), str(path)) for told in error.args)
-    elif isinstance(error, OSError):
+@contextmanager
+def _naming(path: Path, partial: Path, folder: Path | None = None) -> Iterator[None]:
+    """Let the line of a mistake of the block name the output, and not the hidden folder in which it was begun.
+
+    Args:
+        path: The output, for a full disk of which the system tells no name.
+        partial: The hidden folder.
+        folder: What its files will lie in; left out: `path`.
+    """
+    home = str(folder or path)
+    try:
+        yield
+    except InputError as error:
+        error.args = tuple(str(told).replace(str(partial), home) for told in error.args)
+        raise
+    except OSError as error:
         for name in ("filename", "filename2"):
             if isinstance(told := getattr(error, name), str):
-                setattr(error, name, told.replace(str(partial), str(path)))
+                setattr(error, name, told.replace(str(partial), home))
+        name_full_disk(error, path)
+        raise
+
+
+@contextmanager
+def _told_as(path: Path) -> Iterator[None]:
+    """Turn what the system refuses in the block into one line about the output."""
+    try:
+        yield
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+def _require_empty(home: Path, path: Path) -> None:
+    if home.exists() and (not home.is_dir() or any(home.iterdir())):
+        what = "is not empty" if home.is_dir() else "is a file"
+        raise InputError(f"{path}: {what}: name a new or empty folder for the output")
+
+
+def _require_new(paths: Sequence[Path]) -> None:
+    for path in paths:
+        with _told_as(path):
+            is_there = path.exists() or path.is_symlink()
+        if is_there:
+            raise InputError(f"{path} exists already: name a new file or remove it")
 
 
 def unwritable(path: Path, error: OSError) -> InputError:
     """Return the error that says why an output folder cannot be used."""
     return InputError(f"{path}: cannot write there ({error.strerror}): name a folder you may write to")
-
-
-def _start(partial: Path) -> None:
-    """Make an empty hidden folder in place of what a killed command left there, and the folders above it."""
-    partial.parent.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir()
-
-
-def _clear(partial: Path | None, made: list[Path]) -> None:
-    """Remove a hidden folder, and the folders that were made above it."""
-    if partial is not None:
-        shutil.rmtree(partial, ignore_errors=True)
-    _remove_empty(made)
 
 
 def _write_nothing(folder: Path) -> None:

@@ -1,6 +1,7 @@
-from .making import make_afters, make_pair
+from .making import fill_pair, make_afters, make_pair
 
 __all__ = [
+    "fill_pair",
     "make_afters",
     "make_pair",
 ]

@@ -24,7 +24,7 @@ from scenarios.grafted import GraftScenario, Recording
 from scenarios.references import file_digests
 from scenarios.schema import Scenario, SessionPlan
 from sim.graft import Recorded, graft_in_memory, graft_pair
-from sim.session.simulate import HeldPair, simulate_pair
+from sim.session.simulate import HeldPair, simulate_pair, write_pair
 from sim.story.afters import simulate_afters
 
 
@@ -38,12 +38,35 @@ def make_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progress = 
     if not isinstance(scenario, GraftScenario):
         simulate_pair(scenario, seed, out, on_progress)
         return
+    files = _digest_files(scenario)
+    with new_folder(out) as partial:
+        _graft(scenario, seed, files, partial, on_progress)
+
+
+def fill_pair(scenario: Scenario, seed: int, folder: Path, on_progress: Progress = report_nothing) -> None:
+    """Write the pair of a scenario into an empty folder that the caller holds.
+
+    Raises:
+        InputError, ScenarioError: As `make_pair`.
+    """
+    if isinstance(scenario, GraftScenario):
+        _graft(scenario, seed, _digest_files(scenario), folder, on_progress)
+    else:
+        write_pair(scenario, seed, folder, on_progress)
+
+
+def _digest_files(scenario: GraftScenario) -> dict[str, str]:
+    """Return the digests of the files of a scenario; refuse a recording that is named twice."""
     files = file_digests(scenario)
     sessions = [files[name] for name in scenario.recording.sessions]
     if len(set(sessions)) < len(sessions):
         raise InputError(f"{' and '.join(scenario.recording.sessions)}: one and the same recording: name it once")
-    with new_folder(out) as partial, open_recorded(scenario.recording, on_progress) as recorded:
-        graft_pair(scenario, seed, recorded, files, partial, on_progress)
+    return files
+
+
+def _graft(scenario: GraftScenario, seed: int, files: dict[str, str], folder: Path, on_progress: Progress) -> None:
+    with open_recorded(scenario.recording, on_progress) as recorded:
+        graft_pair(scenario, seed, recorded, files, folder, on_progress)
 
 
 def make_afters(scenario: Scenario, plans: Sequence[SessionPlan], seed: int) -> Iterator[HeldPair]:

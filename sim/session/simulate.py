@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections import deque
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -20,6 +19,7 @@ from cdpipe.core.geometry import Float32Array, Float64Array
 from cdpipe.core.plugins import extra_version, require_extra
 from cdpipe.core.progress import Progress, report_nothing
 from cdpipe.core.spooled import SpooledArray
+from cdpipe.core.whole_file import hidden_folder
 from cdpipe.core.yamlfile import setting_lines
 from cdpipe.io.session import CHUNK_SCANS, ScanChunk, Session, SessionWriter, fit_chunk
 from cdpipe.mapping.poses.odometry import Image
@@ -91,29 +91,43 @@ def simulate_pair(scenario: Scenario, seed: int, out: Path, on_progress: Progres
             KISS-ICP estimates it), and how much of how much is done.
 
     Raises:
-        InputError: `out` is not empty or cannot be written, the sensor profile or a trajectory cannot be read, or
-            KISS-ICP is asked for and not installed.
+        InputError: `out` is not empty, cannot be written or another writes it, the sensor profile or a trajectory
+            cannot be read, or KISS-ICP is asked for and not installed.
         ScenarioError: The world contradicts itself.
     """
     report = on_progress or report_nothing
     if (out.exists() or out.is_symlink()) and not (out.is_dir() and not any(out.iterdir())):
         raise InputError(f"{out}: exists and is not an empty folder: name a new one or remove it")
-    drives, files = _plan(scenario, seed, report)
-    # a link to an empty folder is that folder
-    home = Path(os.path.realpath(out)) if out.is_symlink() else out.absolute()
-    partial = home.with_name(f".{home.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
+    planned = _plan(scenario, seed, report)
+    home = Path(os.path.realpath(out))  # a link to an empty folder is that folder
     try:
-        partial.mkdir(parents=True)
-        with ThreadPoolExecutor(min(THREADS, os.cpu_count() or 1)) as pool:
-            for drive in drives:
-                write_session(drive, partial / drive.name, pool, report)
-        write_pair_truth(partial, collect_truth(scenario, seed, drives, files))
-        partial.replace(home)
+        with hidden_folder(home, out) as partial:
+            _write(scenario, seed, *planned, partial, report)
+            partial.replace(home)
     except OSError as error:
         raise InputError(f"{out}: cannot write there: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+
+
+def write_pair(scenario: Scenario, seed: int, folder: Path, report: Progress = report_nothing) -> None:
+    """Write `before`, `after` and `truth` into an empty folder that the caller holds, as `simulate_pair` does.
+
+    Raises:
+        InputError, ScenarioError: As `simulate_pair`.
+    """
+    planned = _plan(scenario, seed, report)
+    try:
+        _write(scenario, seed, *planned, folder, report)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot write there: {error.strerror or error}") from error
+
+
+def _write(
+    scenario: Scenario, seed: int, drives: Sequence[Drive], files: Mapping[str, str], folder: Path, report: Progress
+) -> None:
+    with ThreadPoolExecutor(min(THREADS, os.cpu_count() or 1)) as pool:
+        for drive in drives:
+            write_session(drive, folder / drive.name, pool, report)
+    write_pair_truth(folder, collect_truth(scenario, seed, drives, files))
 
 
 def collect_truth(scenario: Scenario, seed: int, drives: Sequence[Drive], files: Mapping[str, str]) -> PairTruth:

@@ -39,7 +39,7 @@ def simulate(
 ) -> None:
     """Simulate one pair of sessions with truth: DIR/before, DIR/after, DIR/truth."""
     from eval.core.output import new_folder
-    from eval.graft import make_pair
+    from eval.graft import fill_pair
     from scenarios import load_scenario
     from sim.story import simulate_story
 
@@ -47,7 +47,7 @@ def simulate(
         drawn = load_scenario(scenario, seed, join_world_settings(world, settings))
     with shown_warnings(), new_folder(out) as partial, shown_progress(quiet) as progress:
         if sessions == 2:
-            make_pair(drawn, seed, partial, progress.stage)
+            fill_pair(drawn, seed, partial, progress.stage)
         else:
             simulate_story(drawn, seed, sessions, partial, on_progress=progress.stage)
     told = "before, after, truth" if sessions == 2 else f"{sessions} sessions and story.json"

@@ -1,6 +1,7 @@
 import errno
 import os
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -57,6 +58,70 @@ def test_what_a_killed_run_left_does_not_get_into_the_next(tmp_path: Path) -> No
     with new_folder(tmp_path / "out") as partial:
         assert tree(partial) == []
     assert tree(tmp_path) == ["out"]
+
+
+no_locks = pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
+
+
+@no_locks
+@pytest.mark.parametrize("write", [new_folder, new_files])
+def test_a_second_writer_is_refused_and_takes_nothing_from_the_first(
+    tmp_path: Path, write: Callable[[Path], AbstractContextManager[Path]]
+) -> None:
+    out = tmp_path / "out"
+    with write(out) as partial:
+        (partial / "out").write_text("first")
+        for other in (new_folder, new_files):
+            with pytest.raises(InputError, match=r"out: another `tunnelcd` writes there"), other(out):
+                pass
+        assert (partial / "out").read_text() == "first"
+    assert tree(tmp_path) == ["out", "out/out"] if write is new_folder else ["out"]
+
+
+@no_locks
+def test_what_a_living_process_writes_stays_and_what_a_killed_one_left_goes(tmp_path: Path) -> None:
+    told = "from pathlib import Path; from eval.core.output import new_folder\n"
+    told += "with new_folder(Path('out')) as partial: (partial / 'old').touch(); print('begun', flush=True); input()"
+    begin = [sys.executable, "-c", told]
+    with subprocess.Popen(begin, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None and other.stdout.readline() == b"begun\n"
+        with pytest.raises(InputError, match="another `tunnelcd` writes there"), new_folder(tmp_path / "out"):
+            pass
+        assert tree(tmp_path) == [".out.partial", ".out.partial/old"]
+        other.kill()
+    assert tree(tmp_path) == [".out.partial", ".out.partial/old"]
+    with new_folder(tmp_path / "out") as partial:
+        assert tree(partial) == []
+    assert tree(tmp_path) == ["out"]
+
+
+def test_a_link_under_the_hidden_name_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "note").write_text("x")
+    (tmp_path / ".out.partial").symlink_to("mine")
+    with pytest.raises(InputError, match="cannot write there"), new_folder(tmp_path / "out"):
+        pass
+    assert tree(tmp_path) == [".out.partial", "mine", "mine/note"]
+
+
+@pytest.mark.parametrize("write", [new_folder, new_files])
+def test_an_output_that_others_made_meanwhile_stays(
+    tmp_path: Path, write: Callable[[Path], AbstractContextManager[Path]]
+) -> None:
+    with pytest.raises(InputError, match=r"out: cannot write there"), write(tmp_path / "out") as partial:
+        (partial / "out").write_text("x")
+        (tmp_path / "out").mkdir()
+        (tmp_path / "out" / "mine").write_text("x")
+    assert tree(tmp_path) == ["out", "out/mine"]
+
+
+@pytest.mark.parametrize("write", [new_folder, new_files, whole_file])
+def test_a_full_disk_without_a_name_is_that_of_the_output(
+    tmp_path: Path, write: Callable[[Path], AbstractContextManager[Path]]
+) -> None:
+    with pytest.raises(OSError, match="No space left") as caught, write(tmp_path / "out"):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert caught.value.filename == str(tmp_path / "out")
 
 
 def test_a_folder_with_something_in_it_is_refused_and_left_alone(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -22,10 +23,11 @@ from cdpipe.io.session import read_session
 from cdpipe.model.types import PosedScan
 from cdpipe.pipeline import detect
 from cdpipe.training.shard import read_shard
+from eval.core.output import new_folder
 from eval.graft import making
 from eval.graft.adapters import list_adapters, locate_recording
 from eval.graft.clouds import as_session
-from eval.graft.making import make_pair
+from eval.graft.making import fill_pair, make_pair
 from eval.scoring import score
 from eval.training import Recipe, make_shard
 from scenarios.grafted import GraftScenario, Recording
@@ -313,3 +315,27 @@ def test_a_shard_of_a_dataset_is_made_of_a_recording(simulated: Path, tmp_path: 
     assert len(arrays["after_scans"]) == about["counts"]["n_after"] > 0
     assert about["counts"]["n_positive"] > 0
     assert set(np.unique(arrays["labels"])) == {-1, 0, 1}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
+@pytest.mark.parametrize("is_nested", [False, True])
+def test_two_pairs_are_not_written_into_one_folder(tmp_path: Path, is_nested: bool) -> None:
+    scenario = load_scenario("smoke/unchanged", SEED, ["sensor.mode=512x10", "platform.scan_spacing_m=8.0"])
+    out, refused = tmp_path / "pair", []
+
+    def begin_another(stage: str, _done: int, _total: int) -> None:
+        if stage in ("before", "after"):
+            with pytest.raises(InputError, match=r"pair: another `tunnelcd` writes there"), new_folder(out):
+                pass
+            with pytest.raises(InputError, match=r"pair: another `tunnelcd` writes there"):
+                make_pair(scenario, SEED + 1, out)
+            refused.append(stage)
+
+    if is_nested:  # as `tunnelcd simulate` does
+        with new_folder(out) as partial:
+            fill_pair(scenario, SEED, partial, begin_another)
+    else:
+        make_pair(scenario, SEED, out, begin_another)
+    assert {"before", "after"} <= set(refused)
+    assert {path.name for path in out.iterdir()} == {"before", "after", "truth"}
+    assert [path.name for path in tmp_path.iterdir()] == ["pair"]
