@@ -26,13 +26,14 @@ from cdpipe.query.query import find_regions
 from eval.bench.extract import ExtractSite, extract_contests, extract_sites
 from eval.bench.merge import FailedContest, MergeSite, against_limit, merge_contests, paper_sites
 from eval.bench.whole import WholeSite, whole_contests
-from eval.core.output import make_writable, unwritable
+from eval.core.output import make_writable, require_replaceable, unwritable
 from eval.core.provenance import machine
 from sim.studies.bench import BenchSite, sensor_contests
 from sim.studies.timing import Contest, SkippedContest, timed
 
 Contests = Mapping[str, Callable[[], Contest]]
 Row = dict[str, Any]
+_HEAD = b'{\n "machine": {'
 _SPHERE_LIMIT_S = 0.003
 _SCAN_LIMIT_S = 0.1  # a 10 Hz sensor
 _N_REGIONS = 3
@@ -158,6 +159,10 @@ def require_writable(path: Path, *, growth: bool = False, profile: bool = False)
         raise InputError(f"{path}: a file of this name is written beside the table: name one that ends in .json")
     if path.exists() and not path.is_file():
         raise InputError(f"{path}: a device or a pipe: name a file for the table")
+    require_replaceable(path, _HEAD, "table of `tunnelcd bench`")
+    for other in (path.with_suffix(suffix) for suffix in beside if not path.exists()):
+        if other.exists():
+            raise InputError(f"{other}: exists, and no table {path.name} beside it: name a new file, or remove it")
     make_writable(path.absolute().parent)
 
 

@@ -109,7 +109,7 @@ KindOfSite = Annotated[
 Wide = Annotated[bool, typer.Option("--wide", help="print every column and row, however wide")]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON on standard output instead, for programs")]
 JsonFile = Annotated[
-    Path | None, typer.Option("--out", metavar="FILE", help="also write the JSON to this file", show_default=False)
+    Path | None, typer.Option("--out", metavar="FILE", help="also write the JSON to this new file", show_default=False)
 ]
 SetSettings = Annotated[
     list[str] | None,

@@ -138,15 +138,21 @@ def tell_json(value: Any, *, as_json: bool, file: Path | None) -> None:
 
 
 def require_json_file(file: Path | None) -> None:
-    """Check before the work that a file can be written, if one is named.
+    """Check before the work that a new file can be written, if one is named. JSON bears no mark of who wrote it.
 
     Raises:
-        InputError: It is a folder, or its folder is missing or cannot be written.
+        InputError: It exists, or its folder is missing or cannot be written.
     """
     if file is None:
         return
-    if file.is_dir():
+    try:
+        is_folder, is_there = file.is_dir(), file.exists() or file.is_symlink()
+    except OSError as error:
+        raise unwritable(file, error) from error
+    if is_folder:
         raise InputError(f"--out {file}: is a folder: name a file")
+    if is_there:
+        raise InputError(f"--out {file}: exists: name a new file, or remove this one")
     if not file.absolute().parent.is_dir():
         raise InputError(f"--out {file}: there is no folder {file.parent}: make it, or name another one")
     make_writable(file.absolute().parent)

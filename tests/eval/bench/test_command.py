@@ -170,6 +170,23 @@ def test_where_the_table_cannot_go_is_told_before_anything_is_measured(
     assert "cannot write there" in err
 
 
+def test_only_tables_of_earlier_measurements_are_replaced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "list_contests", lambda: {"fast": lambda: FAST})
+    table = tmp_path / "speed.json"
+    for _ in range(2):
+        assert run(capsys, "--out", str(table))[0] == 0
+    table.write_text("[]")
+    told = f"error: {table}: exists, and is no table of `tunnelcd bench`: name a new file, or remove it\n"
+    assert run(capsys, "--out", str(table)) == (2, "", told)
+    notes = tmp_path / "notes.md"
+    notes.write_text("mine")
+    code, _, err = run(capsys, "--profile", "--out", str(tmp_path / "notes.json"))
+    assert (code, err.count("\n")) == (2, 1) and err.startswith(f"error: {notes}: exists")
+    assert (table.read_text(), notes.read_text()) == ("[]", "mine")
+
+
 def test_a_table_that_cannot_be_written_leaves_no_half_file(tmp_path: Path) -> None:
     taken = tmp_path / "speed.json"
     taken.mkdir()

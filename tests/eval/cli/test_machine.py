@@ -142,7 +142,8 @@ def test_the_json_is_written_to_a_file_as_well(
     told = command(*words, "--out", file)
     assert told == plain and told[0] == printed[0]
     assert file.read_text() == printed[1]
-    assert command(*words, "--json", "--out", file)[1] == printed[1]
+    file.unlink()
+    assert command(*words, "--json", "--out", file)[1] == printed[1] == file.read_text()
     assert [path.name for path in tmp_path.iterdir()] == ["found.json"]
 
 
@@ -160,6 +161,23 @@ def test_a_file_that_cannot_be_written_is_refused_before_the_work(
     monkeypatch.setattr("eval.cli.doctor.examine", lambda: pytest.fail("examined"))
     code, out, err = command("doctor", "--out", tmp_path / name)
     assert (code, out, err.count("\n")) == (2, "", 1) and said in err
+
+
+@pytest.mark.parametrize("words", [("list", "plans"), ("check", "smoke"), ("doctor",), ("score", "pair", "answer")])
+@pytest.mark.parametrize("is_linked", [False, True])
+def test_a_file_that_is_there_is_not_replaced(
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], is_linked: bool
+) -> None:
+    monkeypatch.setattr("eval.cli.doctor.examine", lambda: pytest.fail("examined"))
+    monkeypatch.setattr("eval.scoring.scoring.score", lambda *_: pytest.fail("scored"))
+    mine = file = tmp_path / "changes.json"
+    mine.write_text("[]")
+    if is_linked:
+        file = tmp_path / "link.json"
+        file.symlink_to(mine.name)
+    told = f"error: --out {file}: exists: name a new file, or remove this one\n"
+    assert command(*words, "--out", file) == (2, "", told)
+    assert mine.read_text() == "[]" and file.is_symlink() == is_linked
 
 
 @pytest.mark.parametrize("kind", ["scenarios", "plans", "presets", "sensors", "settings"])
