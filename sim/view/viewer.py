@@ -20,6 +20,9 @@ from cdpipe.core.whole_file import whole_file
 from sim.view.returns import CHANGE_RGB, SESSION_RGB
 from sim.view.view import ROCK_AFTER, ROCK_BEFORE, Play, View
 
+PAGE_MARK = '<meta name="generator" content="tunnelcd view">'
+"""Stands near the start of each page that `tunnelcd view` may replace, as in the template of an answer's page."""
+
 _MISSING = "the viewer needs viser: pip install 'tunnelcd[view]'"
 # Of the player: the share of the drives at first, the step, and the pause after a step.
 _START, _STEP, _PAUSE_S = 0.5, 0.002, 0.1
@@ -94,6 +97,7 @@ def write_html(view: View, file: Path, legend: str = "") -> None:
     if legend:
         before, end, after = text.rpartition("</body>")
         text = f"{before}{legend}{end}{after}"
+    text = text.replace("<head>", f"<head>{PAGE_MARK}", 1)
     text = text.replace("<title>Viser</title>", f"<title>{html.escape(view.title)}</title>", 1)
     try:
         file.parent.stat()  # a new folder is not made

@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from eval.report.answer.content import AnswerContent
     from sim.view.view import View
 
-_PAGE = b"<html"  # near the start of the pages of viser and of answers
-
 
 def view(
     what: Annotated[
@@ -77,11 +75,12 @@ def view(
     """Show a world, a pair, a session, a recording, or what an answer found between two of them, in the browser."""
     from cdpipe.core.errors import InputError
     from eval.core.output import require_replaceable
+    from sim.view.viewer import PAGE_MARK
 
     if html is not None and not html.absolute().parent.is_dir():
         raise InputError(f"--html {html}: there is no folder {html.parent}: make it, or name another one")
     if html is not None:
-        require_replaceable(html, _PAGE, "HTML page")
+        require_replaceable(html, PAGE_MARK.encode(), "page of this version of `tunnelcd view`")
     asked = join_world_settings(world, settings)
     hows = how_to_read(
         1 if after is None else 2, form, topics, trajectory, odometry, metadata, deskew=deskew, origin=origin

@@ -15,11 +15,12 @@ import pandas as pd
 from eval.core.charts import BLUE, GREEN, ORANGE, SYMBOLS, Look
 from eval.core.domains import domain_name
 from eval.core.figures import picture_address
-from eval.core.output import make_writable
+from eval.core.output import make_writable, require_replaceable
 from eval.core.statistics import ENOUGH_PAIRS
 from eval.report.comparing.columns import COMPARED
 from eval.report.comparing.differences import (
     BETTER,
+    COLUMNS,
     NOISE,
     NOT_JUDGED,
     SAME,
@@ -91,9 +92,11 @@ def write_comparison(found: Comparison, folder: Path) -> Path:
         Path of the page.
 
     Raises:
-        InputError: The folder cannot be written.
+        InputError: The folder cannot be written, or has another file of such a name.
     """
     make_writable(folder)
+    require_replaceable(folder / "comparison.csv", ",".join(COLUMNS[:2]).encode(), "table of `tunnelcd report A B`")
+    require_replaceable(folder / "comparison.html", b"<title>tunnelcd: ", "page of `tunnelcd report A B`")
     write_file(folder / "comparison.csv", found.table.to_csv(index=False))
     write_file(folder / "comparison.html", render_page("comparison.html", _content(found)))
     return folder / "comparison.html"

@@ -57,6 +57,19 @@ def test_a_comparison_says_so_too(run: Path, tmp_path: Path) -> None:
     assert "infinite or larger than 1e+15" in write_comparison(compare_sides(*sides), tmp_path / "out").read_text()
 
 
+def test_a_comparison_replaces_only_its_own_files(run: Path, tmp_path: Path) -> None:
+    found = compare_sides(*(read_side(f"{run}:{PLAIN[place]}") for place in (0, 1)))
+    for _ in range(2):
+        page = write_comparison(found, tmp_path)
+    for mine in (page, tmp_path / "comparison.csv"):
+        written = mine.read_bytes()
+        mine.write_text("<html><title>mine</title>")
+        with pytest.raises(InputError, match=f"{mine.name}: exists, and is no .*name a new file, or remove it"):
+            write_comparison(found, tmp_path)
+        assert mine.read_text() == "<html><title>mine</title>"
+        mine.write_bytes(written)
+
+
 def test_the_page_of_a_run_that_ends_at_the_merge(run: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     folder.mkdir()

@@ -440,12 +440,14 @@ def test_the_command_writes_a_page_and_tells_faults_in_one_line(
     assert (code, err) == (0, [])
     assert out.startswith(f"{file}: {pair}, ") and file.stat().st_size > 1_000_000
     assert call(str(pair), "--html", str(file), "--quiet") == (0, "", [])
-    for mine in (pair / "after" / "session.json", tmp_path / "mine.yaml"):
+    (tmp_path / "mine.html").write_text("<!doctype html><html><head><title>My notes on tunnelcd</title></head></html>")
+    for mine in (pair / "after" / "session.json", tmp_path / "mine.yaml", tmp_path / "mine.html"):
         mine.touch()
         content = mine.read_bytes()
-        assert call(str(pair), "--html", str(mine)) == (
-            2, "", [f"error: {mine}: exists, and is no HTML page: name a new file, or remove it"],
-        )  # fmt: skip
+        told = (
+            f"error: {mine}: exists, and is no page of this version of `tunnelcd view`: name a new file, or remove it"
+        )
+        assert call(str(pair), "--html", str(mine)) == (2, "", [told])
         assert mine.read_bytes() == content
     missing = tmp_path / "none" / "x.html"
     code, out, err = call(str(pair), "--html", str(missing))
