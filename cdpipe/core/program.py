@@ -20,6 +20,7 @@ _PACKAGES = ("eval", "scenarios", "sim")
 
 def main() -> None:
     """Run the command line and exit; an interrupt before it runs ends with exit code 130, as one while it runs."""
+    open_closed_streams()
     handler = signal.signal(signal.SIGINT, _leave)
     for name in _PACKAGES:
         if other := find_hiding(name):
@@ -31,6 +32,15 @@ def main() -> None:
     run = importlib.import_module("eval.cli.main").main
     signal.signal(signal.SIGINT, handler)
     run()
+
+
+def open_closed_streams() -> None:
+    """Lead standard streams that whoever started this process has closed (`>&-`) to nowhere; Python has None there."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            stream = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115 - as long as the process lives
+            os.set_inheritable(stream.fileno(), True)
+            setattr(sys, name, stream)
 
 
 def find_hiding(name: str) -> str:

@@ -12,6 +12,7 @@ import typer
 
 from cdpipe.core.errors import TunnelcdError
 from cdpipe.core.names import visible
+from cdpipe.core.program import open_closed_streams
 from eval.core.terminal.interrupts import interruptible, interrupts_kept
 
 # A full disk, a read-only one, a file too large for it, a folder or file of another user.
@@ -56,6 +57,7 @@ def run_app(app: typer.Typer, name: str, words: Sequence[str], subcommands: Sequ
         words: The arguments.
         subcommands: Names of the application's commands; a mistake in one of them names that command's --help.
     """
+    open_closed_streams()
     try:
         with interruptible(), input_errors(), interrupts_kept():
             code = app(args=list(words), prog_name=name, standalone_mode=False)

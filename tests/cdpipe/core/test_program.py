@@ -41,3 +41,16 @@ def test_a_module_hides_and_a_folder_without_code_does_not(tmp_path: Path) -> No
 
 def test_nothing_hides_our_own() -> None:
     assert [find_hiding(name) for name in ("eval", "scenarios", "sim", "nobody_has_this")] == [""] * 4
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a shell that closes streams")
+@pytest.mark.parametrize(
+    ("words", "closed"),
+    [("list sensors --out x.json", ">&-"), ("list sensors --out x.json", ">&- 2>&- <&-"), ("check smok", "2>&-")],
+)
+def test_a_closed_stream_leads_nowhere(tmp_path: Path, words: str, closed: str) -> None:
+    command = ["/bin/sh", "-c", f'exec "$0" -c "$1" {words} {closed}', sys.executable, PROGRAM]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (2 if words.startswith("check") else 0, "", "")
+    assert words.startswith("check") or (tmp_path / "x.json").read_text().startswith("[")
