@@ -32,13 +32,15 @@ def trace(
 ) -> None:
     """Find the centrelines of a tunnel mesh and write a scenario along them: nodes, drifts, routes, one added box."""
     from cdpipe.core.whole_file import whole_file
-    from eval.core.output import made_parents
+    from eval.core.output import made_parents, make_writable, unwritable
     from scenarios.schema import MeshFile
     from sim.trace import draft_scenario, format_scenario, save_picture, trace_mesh
 
     picture = _refuse_names(mesh, out, picture)
     file = MeshFile(path=str(mesh), units=units or "m", up=up or ("y" if mesh.suffix.lower() == ".glb" else "z"))
     with made_parents(out), made_parents(picture), shown_progress(quiet) as progress:
+        for path in (out, picture):
+            make_writable(path.absolute().parent)
         found = trace_mesh(
             file,
             is_sure_of_units=units is not None,
@@ -46,9 +48,14 @@ def trace(
             on_progress=progress.stage,
         )
         draft = draft_scenario(found, progress.stage)
-        with whole_file(picture) as partial_picture, whole_file(out) as partial:
-            save_picture(found, partial_picture)
-            partial.write_text(format_scenario(draft, found, out.absolute().parent), encoding="utf-8")
+        text = format_scenario(draft, found, out.absolute().parent)
+        try:
+            with whole_file(picture) as partial_picture:
+                save_picture(found, partial_picture)
+                with whole_file(out) as partial:
+                    partial.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise unwritable(Path(error.filename2 or error.filename or picture), error) from error
     for note in found.notes:
         warn(f"{mesh}: {note}")
     if draft.trouble:

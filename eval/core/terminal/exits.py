@@ -17,8 +17,15 @@ from eval.core.terminal.interrupts import interruptible, interrupts_kept
 
 # A full disk, a read-only one, a file too large for it, a folder or file of another user.
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EACCES, errno.EPERM)
-# A name that no file can have, or that is another's: of a folder, below a file, in a circle of links.
-_NAME_ERRORS = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR)
+# A name that no file can have, or that is another's: of a folder, below a file, in a circle of links, with files in it.
+_NAME_ERRORS = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR, errno.ENOTEMPTY)
+# A disk that fails, or a network disk on which another machine has removed the file.
+_FAILURES = (errno.EIO, errno.ESTALE)
+_WAYS = {
+    **dict.fromkeys(_DISK_ERRORS, "give it a disk with room and leave to write"),
+    **dict.fromkeys(_NAME_ERRORS, "name another one"),
+    **dict.fromkeys(_FAILURES, "the disk, or the network to it, failed: start the command again once it works"),
+}
 
 
 @contextmanager
@@ -31,10 +38,11 @@ def input_errors() -> Iterator[None]:
             sys.stderr.write(f"error: {visible(line)}\n")
         raise SystemExit(2) from error
     except OSError as error:
-        if error.errno not in (*_DISK_ERRORS, *_NAME_ERRORS):
+        way = _WAYS.get(error.errno or 0)
+        if way is None:
             raise
-        what = visible(f"{error.filename2 or error.filename or 'the output'}: {error.strerror}")
-        way = "name another one" if error.errno in _NAME_ERRORS else "give it a disk with room and leave to write"
+        unnamed = "a file" if error.errno in _FAILURES else "the output"
+        what = visible(f"{error.filename2 or error.filename or unnamed}: {error.strerror}")
         sys.stderr.write(f"error: {what}: {way}\n")
         raise SystemExit(2) from error
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -82,3 +84,31 @@ def test_units_that_are_named_are_taken(tmp_path: Path, capsys: pytest.CaptureFi
     assert picture.is_file()
     nodes = yaml.safe_load(out.read_text())["tunnel"]["nodes"]
     assert 25.0 < max(x for x, _, _ in nodes.values()) < 30.0
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc, where nobody can make a file")
+def test_a_picture_that_cannot_be_written_is_told_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mesh = save_drift(tmp_path / "mine.stl")
+    monkeypatch.setattr("sim.trace.trace_mesh", lambda *_, **__: pytest.fail("traced"))
+    code, out, err = run(capsys, "trace", mesh, "--out", tmp_path / "a" / "b" / "t.yaml", "--picture", "/proc/x.png")
+    assert (code, out, err.count("\n")) == (2, "", 1) and err.startswith("error: /proc: cannot write there")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.stl"]
+
+
+@pytest.mark.parametrize("full", ["t.yaml", "t.png"])
+def test_a_full_disk_is_told_with_the_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, full: str
+) -> None:
+    def fill(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    mesh = save_drift(tmp_path / "mine.stl")
+    if full == "t.png":
+        monkeypatch.setattr("sim.trace.save_picture", fill)
+    else:
+        monkeypatch.setattr(Path, "write_text", fill)
+    code, _, err = run(capsys, "trace", mesh, "--out", tmp_path / "t.yaml", "--quiet")
+    assert code == 2 and err.startswith(f"error: {tmp_path / full}: cannot write there (No space left on device)")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.stl"]
