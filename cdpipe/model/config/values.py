@@ -17,8 +17,9 @@ def _require_width(value: Any) -> Any:
 
 
 Positive = Annotated[float, Field(gt=0)]
-# Smaller cells hold only noise, and `cell_keys` could not number them a kilometre from the origin.
-Cell = Annotated[float, Field(ge=0.01)]
+# Smaller cells hold only noise, and `cell_keys` could not number them a kilometre from the origin; of larger ones, one
+# holds the whole tunnel.
+Cell = Annotated[float, Field(ge=0.01, le=1000)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
 NonNegative = Annotated[float, Field(ge=0)]

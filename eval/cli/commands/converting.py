@@ -56,7 +56,7 @@ def convert(
     ] = False,
     cell: Annotated[
         float | None,
-        typer.Option(min=0.01, help="one point per cell of a map, metres", show_default=str(_CELL_M)),
+        typer.Option(min=0.01, max=1000, help="one point per cell of a map, metres", show_default=str(_CELL_M)),
     ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, help="seed of a scenario; 0 if left out", show_default=False)

@@ -230,6 +230,7 @@ def check(
 ) -> None:
     """Validate scenarios, plans and presets without running anything."""
     from cdpipe.core.errors import InputError
+    from cdpipe.core.names import visible
 
     require_json_file(out)
     mistakes: list[str] = []
@@ -239,7 +240,7 @@ def check(
         try:
             found = check_file(file)
         except InputError as error:
-            own = str(error).split("\n")
+            own = str(error).replace(file, visible(file)).split("\n")  # the name may have a line break
         mistakes += own
         rows.append({"file": file, "is": found or None, "mistakes": own})
         if found and not as_json:

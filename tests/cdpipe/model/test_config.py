@@ -130,7 +130,14 @@ def test_a_key_without_its_group_gets_the_whole_key() -> None:
 
 
 @pytest.mark.parametrize(
-    "setting", ["extract.origin_m=.nan", "extract.origin_m=1e9", "query.threshold=.inf", "extract.voxel_m=1e-7"]
+    "setting",
+    [
+        "extract.origin_m=.nan",
+        "extract.origin_m=1e9",
+        "query.threshold=.inf",
+        "extract.voxel_m=1e-7",
+        "extract.voxel_m=1e308",
+    ],
 )
 def test_numbers_that_no_stage_could_use_are_refused(setting: str) -> None:
     with pytest.raises(InputError, match=f"--set: {setting.partition('=')[0]} = .*: input should be"):

@@ -123,6 +123,12 @@ def test_doctor_as_json(command: Command, monkeypatch: pytest.MonkeyPatch) -> No
     assert command("doctor", "--json")[0] == 0
 
 
+def test_a_name_with_a_line_break_is_one_mistake(command: Command, tmp_path: Path) -> None:
+    code, out, err = command("check", tmp_path / "x\ny.yaml")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"error: {tmp_path / 'x'}\\ny.yaml: no such file")
+
+
 def test_a_score_as_json(command: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("eval.scoring.scoring.score", lambda *_: {"region_recall": 1.0, "t_cd_s": float("nan")})
     code, out, err = command("score", tmp_path, tmp_path, "--json")
