@@ -181,7 +181,8 @@ def _tell_split(group: Sequence[CheckedFile]) -> Iterator[str]:
     seeds = [pair.seed for pair in group[0].content.pairs]
     split = find_split(seeds, [each.content.split for each in group])
     if split != "dev":
-        yield split or f"seeds {min(seeds)} to {max(seeds)} of no split"
+        first, last = min(seeds), max(seeds)
+        yield split or f"{f'seed {first}' if first == last else f'seeds {first} to {last}'} of no split"
 
 
 def take_rows(each: CheckedFile) -> pd.DataFrame:
