@@ -204,6 +204,13 @@ def resampled_recalls(ranked: RankedPairs, rate_per_100m: float, seed: int = 0) 
 
     Two methods that ran the same pairs get the same draws, so that their difference can be taken draw by draw.
     """
+    weights = _drawn_weights(ranked, seed)
+    batches = range(0, N_RESAMPLES, _BATCH)
+    return np.concatenate([_recalls(ranked, rate_per_100m, weights[first : first + _BATCH]) for first in batches])
+
+
+def _drawn_weights(ranked: RankedPairs, seed: int) -> Float64Array:
+    """Return (N_RESAMPLES, P) how often each draw of tunnels, within each kind of site, holds each pair."""
     weights = np.zeros((N_RESAMPLES, len(ranked.pairs)))
     for site in np.unique(ranked.site):
         own = np.flatnonzero(ranked.site == site)
@@ -212,8 +219,7 @@ def resampled_recalls(ranked: RankedPairs, rate_per_100m: float, seed: int = 0) 
         draws = stream(seed, "bootstrap", f"site {site}").integers(n, size=(N_RESAMPLES, n))
         times = np.bincount((n * np.arange(N_RESAMPLES)[:, None] + draws).ravel(), minlength=n * N_RESAMPLES)
         weights[:, own] = times.reshape(N_RESAMPLES, n)[:, tunnel]
-    batches = range(0, N_RESAMPLES, _BATCH)
-    return np.concatenate([_recalls(ranked, rate_per_100m, weights[first : first + _BATCH]) for first in batches])
+    return weights
 
 
 def recall_difference(
