@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -75,6 +76,64 @@ def test_recall_at_every_step(plan: Plan) -> None:
     assert (low, high) == (0.5, 1.0)
 
 
+def test_every_column_of_a_step(plan: Plan) -> None:
+    results, *items = tables(EVERY | {(BASE, "c2c"): ("1", "x")})
+    # one of the two pairs states each mean, and it differs from pair to pair
+    is_first = results["seed"] == 7
+    results = results.assign(region_auroc=np.where(is_first, 0.7, 0.9), object_f1_50=np.where(is_first, np.nan, 0.25))
+    rows = hardness_table(results, *items, plan).to_dict("records")
+    steps = [(axis.name, number, step) for axis in plan.axes for number, step in enumerate(axis.steps, start=1)]
+    assert [(row["axis"], row["step"], row["value"]) for row in rows[::2]] == [
+        (name, number, step.value) for name, number, step in steps
+    ]
+    # methods go by their own name at every step, worlds by their settings
+    assert [row["variant"] for row in rows] == ["tunnelcd", "c2c"] * 5
+    assert [row["scenario"] for row in rows[::2]] == [TALL, BASE, LOW, BASE, BASE]
+    assert [row["unit"] for row in rows[::2]] == ["m"] * 3 + [""] * 2
+    for row in rows:
+        assert (row["n_planned"], row["n_pairs"], row["n_judged"], row["n_observable"]) == (2, 2, 2, 4)
+        means = [row[name] for name in ("region_auroc", "object_iou_point", "object_f1_50")]
+        assert means == pytest.approx([0.8, 0.25, 0.25])
+
+
+def test_fewer_seeds_of_the_first_world_are_fewer_planned_pairs(tmp_path: Path) -> None:
+    (tmp_path / "plan.yaml").write_text(PLAN.replace("[smoke/one_box]", "[{name: smoke/one_box, n_seeds: 1}]"))
+    fewer = load_plan(str(tmp_path / "plan.yaml"))
+    assert set(hardness_table(*tables(EVERY), fewer)["n_planned"]) == {1}
+
+
+def test_a_step_that_was_not_run_counts_nothing(plan: Plan) -> None:
+    some = {case: found for case, found in EVERY.items() if case != (LOW, "c2c")}
+    table = hardness_table(*tables(some), plan).set_index(["axis", "variant", "step"])
+    row = table.loc[("height", "c2c", 3)]
+    counts = ["n_pairs", "n_judged", "n_failed", "n_observable"]
+    assert row[counts].tolist() == [0, 0, 0, 0] and row["n_planned"] == 2
+    assert row[["recall_at_0.1", "region_auroc", "object_iou_point", "object_f1_50"]].isna().all()
+
+
+def test_a_plan_of_which_nothing_was_run(plan: Plan) -> None:
+    table = hardness_table(*tables(EVERY), plan)
+    nothing = hardness_table(pd.DataFrame(), pd.DataFrame(), pd.DataFrame(), plan)
+    assert nothing["variant"].tolist() == table["variant"].tolist()
+    # numbers all the same
+    assert nothing["recall_at_0.1"].dtype == table["recall_at_0.1"].dtype == np.float64
+    points = breaking_points(nothing)
+    # the first step finds nothing, so it says nothing either
+    assert points["step"].tolist() == [1] * 4 and not points["is_measured"].any()
+    assert points[["recall", "recall_low", "recall_high"]].isna().all(axis=None)
+    assert points[["n_judged", "n_failed"]].to_numpy().tolist() == [[0, 0]] * 4
+    assert len(breaking_points(pd.DataFrame())) == 0
+
+
+def test_an_interval_needs_two_tunnels_with_a_change(plan: Plan) -> None:
+    results, regions, changes = tables(EVERY)
+    one = results["seed"] == 7
+    table = hardness_table(
+        results.assign(n_observable=np.where(one, 2, 0)), regions, changes[changes["seed"] == 7], plan
+    )
+    assert table[["recall_at_0.1_low", "recall_at_0.1_high"]].isna().all(axis=None)
+
+
 def test_no_candidate_and_no_change_at_all_break_no_table(plan: Plan) -> None:
     results, _, changes = tables(dict.fromkeys(EVERY, ("x", "x")))
     empty = pd.DataFrame(columns=["scenario", "seed", "variant"])  # as a run writes a table without rows
@@ -109,6 +168,32 @@ def test_breaking_points(plan: Plan) -> None:
     spread = ["recall_low", "recall_high", "n_judged", "n_failed"]
     assert points.loc[("height", "c2c"), spread].tolist() == [0.0, 0.5, 2, 1]
     assert points["is_measured"].all()
+
+
+def test_the_columns_of_a_breaking_point(plan: Plan) -> None:
+    points = breaking_points(hardness_table(*tables(EVERY), plan))
+    names = [
+        ("height", "m", "tunnelcd"),
+        ("height", "m", "c2c"),
+        ("keyframes", "", "tunnelcd"),
+        ("keyframes", "", "c2c"),
+    ]
+    assert list(map(tuple, points[["axis", "unit", "variant"]].to_numpy())) == names
+    assert list(points.columns) == [
+        "axis", "unit", "variant", "step", "value", "recall", "recall_low", "recall_high", "n_judged", "n_failed",
+        "is_measured",
+    ]  # fmt: skip
+    # where it holds, the figures are of the last step
+    assert points.iloc[0, 3:].tolist() == [0, "", 0.5, 0.5, 0.5, 2, 0, True]
+
+
+def test_a_later_step_that_was_not_run_takes_no_verdict_back(plan: Plan) -> None:
+    some = {case: found for case, found in EVERY.items() if case != (LOW, "c2c")}
+    points = breaking_points(hardness_table(*tables(some), plan)).set_index(["axis", "variant"])
+    assert points.loc[("height", "c2c"), "is_measured"] and points.loc[("height", "c2c"), "step"] == 2
+    # more pairs than planned are enough, fewer are not
+    more = plan.model_copy(update={"seeds": plan.seeds[:1]})
+    assert breaking_points(hardness_table(*tables(EVERY), more))["is_measured"].all()
 
 
 def test_a_step_that_was_not_run_gives_no_verdict(plan: Plan) -> None:
