@@ -286,7 +286,9 @@ PAIR = {"before": session_of(20, 3), "after": session_of(20, 3)}
 
 @pytest.mark.parametrize("axis", [1, 2])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize(("aside_m", "told"), [(0.4, None), (0.6, r"2 of 2 objects .*: objects\[0\] is 0\.6 m")])
+@pytest.mark.parametrize(
+    ("aside_m", "told"), [(0.4, None), (0.5, None), (0.6, r"2 of 2 objects .*: objects\[0\] is 0\.6 m")]
+)
 def test_points_beside_their_returns(axis: int, sign: float, aside_m: float, told: str | None) -> None:
     shift_m = sign * aside_m * np.eye(3)[axis]
     for session, known_m in (("before", 0.0), ("after", AFTER_M)):
@@ -294,7 +296,7 @@ def test_points_beside_their_returns(axis: int, sign: float, aside_m: float, tol
             module._check_places(report_of([placed(session, known_m + shift_m)] * 2), PAIR)
 
 
-@pytest.mark.parametrize(("aside_m", "is_refused"), [(1.9, False), (2.1, True)])
+@pytest.mark.parametrize(("aside_m", "is_refused"), [(1.9, False), (2.0, False), (2.1, True)])
 def test_one_object_alone_may_lie_two_metres_aside(aside_m: float, is_refused: bool) -> None:
     alone = report_of([placed("before", np.array([0.0, 0.0, aside_m]))])
     with taken_or_refused(r"1 of 1 objects .*: objects\[0\] is 2\.1 m" if is_refused else None):

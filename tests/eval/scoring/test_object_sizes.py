@@ -113,6 +113,15 @@ def test_of_a_prop_from_a_mesh_that_fell_over_nobody_knows_the_middle() -> None:
     np.testing.assert_allclose(find_true_displacements_map(turned)[0], [4.0, 0.0, 0.0], atol=1e-12)
 
 
+def test_a_prop_of_unknown_height_may_lean_by_two_degrees() -> None:
+    props = [{"name": "thing", "size_m": None}]
+    for angle_deg, is_known in ((2.0, True), (2.01, False)):
+        cos, sin = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
+        leaning = make_pose(np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]]), (4.0, 0.0, 0.0))
+        found = find_true_displacements_map(truth_of(moved(np.eye(4), leaning), props=props))
+        assert np.isfinite(found).all() == is_known
+
+
 def test_both_halves_say_the_same_and_a_turned_map_turns_it() -> None:
     changes = moved(make_pose(translation=(4.0, 1.0, 0.0)), make_pose(translation=(7.0, 1.0, 0.0)))
     truth = truth_of(changes, yaw_pose(np.pi / 2, (50.0, -3.0, 1.0)))

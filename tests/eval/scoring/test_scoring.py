@@ -364,6 +364,18 @@ NOT_OF_THE_MERGE += [
 ]
 
 
+def test_what_a_plan_made_from_the_pair_itself_may_lie_anywhere(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
+    right = true_report(tiny_pair, tiny_merge)
+    elsewhere = tuple(replace(each, points_map=each.points_map + 40.0) for each in right.objects)
+    folder = tiny_pair.parent / "answer"
+    write_answer(folder, "test-method", replace(right, objects=elsewhere))
+    truth = load_ground_truth(tiny_pair)
+    with pytest.raises(InputError, match=r"3 of 3 objects do not lie where object_returns says"):
+        score_stored(truth, folder)
+    case = score_stored(truth, folder, may_end_early=True)
+    assert (case.row["status"], case.row["n_found_changes"]) == ("ok", 3)
+
+
 @pytest.mark.parametrize("has_changes", [True, False])
 def test_an_answer_that_ends_at_the_merge_is_scored_up_to_it(
     write_tiny_pair: Callable[..., Path], tiny_merge: np.ndarray, has_changes: bool
