@@ -282,6 +282,15 @@ def test_withdrawn_regions_count_before_and_not_after(tiny_pair: Path, tiny_merg
     assert plain["n_withdrawn"] == 0
 
 
+def test_the_row_of_a_region_says_whether_it_is_looked_at_whatever_the_threshold(
+    tiny_pair: Path, tiny_merge: np.ndarray
+) -> None:
+    report = true_report(tiny_pair, tiny_merge)
+    forced = replace(report.regions, is_forced=np.array([True, False, True]))
+    case = scored(tiny_pair, replace(report, regions=forced))
+    assert [row["is_forced"] for row in case.regions] == [True, False, True]
+
+
 def test_displacement_and_volume_are_in_the_row_and_the_items(tiny_pair: Path, tiny_merge: np.ndarray) -> None:
     # every thing of the tiny pair stands at the world's origin, has 1 m3, and "moved" by nothing
     report = true_report(tiny_pair, tiny_merge)
@@ -374,6 +383,17 @@ def test_what_a_plan_made_from_the_pair_itself_may_lie_anywhere(tiny_pair: Path,
         score_stored(truth, folder)
     case = score_stored(truth, folder, may_end_early=True)
     assert (case.row["status"], case.row["n_found_changes"]) == ("ok", 3)
+
+
+@pytest.mark.parametrize("until", [None, "merge"])
+def test_a_score_says_which_columns_metrics_of_others_made(
+    tiny_pair: Path, tiny_merge: np.ndarray, until: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("eval.scoring.scoring.compute_plugin_columns", lambda *_: {"mine": 1.0, "other": 2.0})
+    report = without_objects_and_regions(true_report(tiny_pair, tiny_merge))
+    write_answer(tiny_pair.parent / "answer", "test-method", report, until)
+    case = score_stored(load_ground_truth(tiny_pair), tiny_pair.parent / "answer", may_end_early=True)
+    assert case.plugins == {"mine", "other"} and (case.row["mine"], case.row["other"]) == (1.0, 2.0)
 
 
 @pytest.mark.parametrize("has_changes", [True, False])

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from cdpipe.core.geometry import make_pose
+from cdpipe.io.answer import Answer
 from cdpipe.model.report import ChangedObject
 from eval.scoring.object_metrics import judge_kinds, match_objects
 from eval.scoring.object_sizes import compute_size_errors, find_true_displacements_map
+from eval.scoring.scoring import score_answer
 from eval.scoring.twins import Label, label_changes, list_drawn_labels, list_twins
 from eval.truth.ground_truth import GroundTruth
 from sim.session.truth import Change
@@ -94,6 +96,15 @@ def test_the_changes_among_which_labels_are_exchanged_are_listed() -> None:
     changes = [gone(4, "A", 2.0), come(7, "B", 9.0), gone(8, "C", 5.0)]
     truth = truth_of(changes, props=[prop("A"), prop("B"), prop("C", 0.5)])
     assert list_twins(truth) == [[7], [4], []]
+    # the two halves of a move have no twin, whatever stands after them
+    changes = [*carried(1, "C", 20.0, 25.0), gone(4, "A", 2.0), come(7, "B", 9.0)]
+    truth = truth_of(changes, props=[prop("A"), prop("B"), prop("C", 0.5)])
+    assert list_twins(truth) == [[], [], [7], [4]]
+
+
+def test_the_row_of_a_change_names_its_twins() -> None:
+    case = score_answer(Answer("failed", "too dark", "mine", None, {}, {}), two_barrels())
+    assert [row["twins"] for row in case.changes] == ["2;3", "1;3", "1;2"]
 
 
 def test_one_of_them_was_carried_all_the_same() -> None:

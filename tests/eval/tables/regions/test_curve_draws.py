@@ -126,7 +126,7 @@ def test_what_fills_no_cell_is_no_change_to_find() -> None:
 
 def test_no_pair_at_all_has_no_recall() -> None:
     none = ranked_pairs(results([]), regions([]), changes([]))
-    assert np.isnan(recall_at(none, 0.1)) and not none.has_interval
+    assert np.isnan(recall_at(none, 0.1)) and not none.has_interval and len(none.tunnels) == 0
     assert [len(part) for part in free_response(none)] == [0, 0]
     assert found_at(none, 0.1).tolist() == []
     unmade = results([(1, 4.5, "failed", np.nan, np.nan)])  # a world that was not made
@@ -142,6 +142,30 @@ def test_a_pair_with_just_ten_times_the_allowed_false_regions_is_kept() -> None:
         tables = ranked_pairs(results(cases), found, truth)
         assert recall_at(tables, 0.1) == recall
         assert found_at(tables, 0.1).tolist() == [bool(recall)]
+
+
+def test_no_change_of_a_lost_pair_is_found_and_one_false_region_loses_none() -> None:
+    # both changes of the second pair, at 8, are worth the first pair, which the false region at 8 loses
+    cases = [(1, 4.5, "ok", 100.0, 1), (2, 4.5, "ok", 1900.0, 2)]
+    truth = changes([(seed, each, True, 20, False, 1.0, 10) for seed, each in ((1, 1), (2, 1), (2, 2))])
+    found = regions([(1, 9.0, "1"), (1, 8.5, ""), (1, 8.0, ""), (2, 8.0, "1;2")])
+    tables = ranked_pairs(results(cases), found, truth)
+    assert recall_at(tables, 0.1) == 2 / 3
+    assert found_at(tables, 0.1).tolist() == [False, True, True]
+    # a single false region is allowed on the shortest way
+    cases = [(1, 4.5, "ok", 50.0, 1), (2, 4.5, "ok", 950.0, 0)]
+    one = ranked_pairs(results(cases), regions([(1, 9.0, ""), (1, 8.0, "1")]), truth.iloc[:1])
+    assert (recall_at(one, 0.1), found_at(one, 0.1).tolist()) == (1.0, [True])
+
+
+def test_a_pair_is_lost_once_whatever_comes_after() -> None:
+    # 50 m keep one false region: the second loses the change of the first pair, and the third no other
+    cases = [(1, 4.5, "ok", 50.0, 1), (2, 4.5, "ok", 950.0, 2)]
+    truth = changes([(seed, each, True, 20, False, 1.0, 10) for seed, each in ((1, 1), (2, 1), (2, 2))])
+    for own in ([(1, 8.0, "")], [(1, 8.0, ""), (1, 7.0, "")], [(1, 8.0, ""), (1, 7.0, ""), (1, 6.5, "")]):
+        found = regions([(1, 9.0, "1"), *own, (2, 6.0, "1;2")])
+        expected = 1.0 if len(own) == 1 else 2 / 3
+        assert recall_at(ranked_pairs(results(cases), found, truth), 0.1) == expected
 
 
 def test_every_column_of_a_pair_is_its_own() -> None:

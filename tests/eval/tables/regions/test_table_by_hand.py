@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from eval.core.statistics import interval_of
+from eval.core.statistics import interval_of, wilson_interval
 from eval.tables.regions.curves import ranked_pairs, resampled_recalls
 from eval.tables.regions.table import region_overview, region_tables
 from tests.eval.tables.regions.test_table import NAN, TARGETS, changed, tables, the_row, the_target, unchanged
@@ -33,6 +33,7 @@ def test_every_count_of_a_row() -> None:
         "km_unchanged": 1.0, "false_regions_per_100m": 0.0, "false_regions_per_100m_unchanged": 0.0,
     }  # fmt: skip
     assert {name: row[name] for name in counts} == counts
+    assert (row["silent_low"], row["silent_high"]) == wilson_interval(1, 1)
     means = {
         "region_auroc": 0.7, "region_precision": 0.375, "region_recall_proposed": 0.75,
         "region_recall_at_k_proposed": 0.5, "region_recall": 0.0, "region_recall_at_k": 0.0,
@@ -70,7 +71,10 @@ def test_recall_at_a_rate_has_an_interval_over_tunnels_and_a_twin_for_proposals(
          "is_withdrawn": gone}
         for seed, score, of, gone in [(0, 9.0, "1", False), (1, 5.0, "1", True), (2, 1.0, "", False)]
     ]  # fmt: skip
-    row = the_row(tables(rows, regions=found)["regions_table"], "in")
+    every = tables(rows, regions=found)
+    row, budgets = the_row(every["regions_table"], "in"), every["budgets"]
+    # what was withdrawn was looked at: budgets are of proposals
+    assert set(budgets["recall"][(budgets["price"] == "spheres") & (budgets["site"] == "narrow")]) == {0.5}
     truth = pd.DataFrame([{**each, "id": 1, "is_observable": True, "n_truth_cells": 20} for each in rows])
     kept = ranked_pairs(pd.DataFrame(rows), pd.DataFrame(found), truth)
     for rate in (0.1, 0.5):
@@ -107,6 +111,7 @@ def test_every_method_is_in_every_table_in_the_order_of_the_rows() -> None:
     expected = [(domain, name) for domain in ("in", "out", "all") for name in ("tunnelcd", "paper", "c2c")]
     for name in ("regions_table", "regions_by_size", "budgets", "roc", "froc"):
         assert list(found[name].groupby(["domain", "variant"], sort=False).groups) == expected
+        assert found[name].index.tolist() == list(range(len(found[name])))
 
 
 def test_a_run_is_judged_unless_it_is_said_to_lack_pairs() -> None:
@@ -127,10 +132,23 @@ def test_budgets_of_all_sites_and_of_each_kind() -> None:
         alone = tables(own)["budgets"]
         alone = alone[alone["site"] == "all"].drop(columns="site").reset_index(drop=True)
         pd.testing.assert_frame_equal(of_site[site], alone)
+    # the last part of a name counts
+    deeper = tables([changed("own/null/narrow", 1), changed("mine/narrow", 1)])["budgets"]
+    assert list(deeper["site"].unique()) == ["all", "narrow"]
     # rows that name no family are told apart by their world
     nameless = [{name: value for name, value in row.items() if name != "family"} for row in rows]
     names = ["all", "regions/narrow", "null/narrow", "regions/wide"]
     assert list(tables(nameless)["budgets"]["site"].unique()) == names
+
+
+def test_budgets_of_bytes_are_of_what_candidates_ask_for() -> None:
+    names = {"scenario": "narrow", "seed": 1, "variant": "tunnelcd", "is_withdrawn": False}
+    found = [{**names, "score": 1.0, "found_changes": "1", "asked_points": 10.0, "radius_m": 4.5}]
+    budgets = tables([changed("narrow", 1)], regions=found)["budgets"]
+    of_bytes = budgets[(budgets["price"] == "bytes") & (budgets["site"] == "all")].set_index("budget")
+    # of 1,000 bytes of map 100 are kept, and ten points of 12 bytes are asked for
+    assert of_bytes.loc[[0.2, 0.5], "recall"].tolist() == [0.0, 1.0]
+    assert of_bytes["asked_share"].to_numpy() == pytest.approx(0.12)
 
 
 def test_the_overview_shows_each_number_under_its_heading() -> None:
