@@ -95,9 +95,8 @@ def hidden_folder(path: Path, called: Path | None = None) -> Iterator[Path]:
                 Path(child.path).unlink()
         yield partial
     finally:
-        if _is_held(
-            handle, partial
-        ):  # a folder that was renamed has its own name; there may be the next one of another
+        # a folder that was renamed has its own name; under this one there may be the next one of another
+        if _is_held(handle, partial):
             shutil.rmtree(partial, ignore_errors=True)
         if handle is not None:
             os.close(handle)
