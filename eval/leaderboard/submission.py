@@ -78,7 +78,7 @@ class PairPart(Settings):
     seed: Annotated[int, Field(ge=0)]
     pair_digest: Literal[""] | _Digest
     seconds: Annotated[float, Field(ge=0, le=1e8)]
-    row: dict[_Name, Cell]
+    row: Annotated[dict[_Name, Cell], Field(max_length=1_000)]
     files: dict[Literal["answer.json", "answer.npz"], FilePart]
 
 

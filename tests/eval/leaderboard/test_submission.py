@@ -178,6 +178,7 @@ HOSTILE: dict[str, tuple[Change, str]] = {
     "deep JSON": (lambda m: m.update({"submission.json": b"[" * 10_000}), "nested"),
     "unknown key": (in_manifest(lambda d: d.update({"x": 1})), "x"),
     "text for a number": (in_row(region_recall="<b>"), "expected a number"),
+    "columns without end": (in_row(**{f"c{n}": None for n in range(1_000)}), "pairs.0.row"),
     "a list for a number": (in_row(region_recall=[1]), "region_recall"),
     "a share for a truth value": (in_row(is_unchanged_pair=0.5), "expected a truth value"),
     "a figure without end": (in_row(t_total_s=float("inf")), "larger than any figure"),
