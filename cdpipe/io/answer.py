@@ -44,7 +44,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import read_json, read_npz
+from cdpipe.core.files import read_json, read_npz, require_plain_file
+from cdpipe.core.files.json_file import MAX_BYTES
 from cdpipe.core.geometry import Float64Array
 from cdpipe.core.whole_file import whole_file
 from cdpipe.io.answer_parts import (
@@ -72,6 +73,7 @@ from cdpipe.model.report import (
 )
 
 ANSWER_FILES = ("answer.json", "answer.npz")
+_MOST_BYTES = {"answer.json": MAX_BYTES, "answer.npz": 2 << 30}  # 10 million points of a surface are 0.8 GB
 # Fields of an object that answer.json holds as they are.
 _OF_SURFACE = (*SURFACE, *SURFACE_UNROLLED)
 _OBJECT_FIELDS = ("session", "kind", "region", "score", "partner")
@@ -183,13 +185,21 @@ def write_failure(
     _write_json(folder, document, until)
 
 
+def require_answer_sizes(folder: Path) -> None:
+    """Raise `InputError` if a file of an answer is larger than one that is read, or no plain file."""
+    for name, most_bytes in _MOST_BYTES.items():
+        if (folder / name).exists():
+            require_plain_file(folder / name, most_bytes)
+
+
 def read_answer(folder: Path | str) -> Answer:
     """Read an answer.
 
     Raises:
-        InputError: It is missing, damaged or inconsistent; the text names the file and the field.
+        InputError: It is missing, damaged, too large or inconsistent; the text names the file and the field.
     """
     folder = Path(folder)
+    require_answer_sizes(folder)
     path = folder / "answer.json"
     value = read_json(path, "expected an answer written by `tunnelcd detect` or by another method")
     document = check_document(path, value)

@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 
 from cdpipe.core.errors import InputError, MergeFailedError, TunnelcdError
 from cdpipe.core.names import path_part
-from cdpipe.io.answer import ANSWER_FILES, write_failure
+from cdpipe.io.answer import ANSWER_FILES, require_answer_sizes, write_failure
 from eval.core.output import remove
 from eval.core.provenance import digest, machine, versions
 from eval.core.terminal.progress import RunProgress, Silent
@@ -288,9 +288,7 @@ def _call(run: RunFolder, method: Method, pair: Pair, opened: tuple[PairStages, 
             return CallFile(pair_digest=known, seconds=0.0, error=str(reason)[:_MOST_ERROR], stderr="")
         copy_pair(original, places["before"].parent)
         ended = run_command(method.command, places, places["work"], method.limit_s)
-        error = ended.error
-        if not error and not (places["out"] / "answer.json").is_file():
-            error = "the command ended well and left no {out}/answer.json"
+        error = ended.error or _find_no_answer(places["out"])
         if error:
             write_failure(answer, method.name, "failed", error, {}, {})
         else:
@@ -299,6 +297,17 @@ def _call(run: RunFolder, method: Method, pair: Pair, opened: tuple[PairStages, 
                 if (places["out"] / name).is_file():
                     shutil.copyfile(places["out"] / name, answer / name)
     return CallFile(pair_digest=known, seconds=ended.seconds, error=error, stderr=ended.stderr)
+
+
+def _find_no_answer(out: Path) -> str:
+    """Return why a folder that a command left holds no answer to be copied, "" where it does."""
+    if not (out / "answer.json").is_file():
+        return "the command ended well and left no {out}/answer.json"
+    try:
+        require_answer_sizes(out)  # a copy of what no reader takes could fill the disk
+    except InputError as mistake:
+        return f"no valid answer: {str(mistake).replace(f'{out}/', '')}"
+    return ""
 
 
 def _score(method: Method, truth: GroundTruth, folder: Path, call: CallFile) -> tuple[CallFile, CaseScore]:

@@ -83,6 +83,7 @@ def test_a_method_sees_blind_sessions_and_an_empty_folder_of_its_own(evaluator: 
         (GOOD.replace("[[90.0, 0, 0]]", "[[float('nan'), 0, 0]]"), "no valid answer"),
         (GOOD + "\n(out / 'answer.npz').write_bytes(b'PK')", "no valid answer: answer.npz: unreadable"),
         (GOOD + "\nsys.exit(3)", "exit code 3"),
+        (GOOD + "\n(out / 'answer.npz').open('r+b').truncate(3 << 30)", "answer.npz: 3221 MB, more than the 2147 MB"),
     ],
 )
 def test_a_pair_without_an_answer_is_a_row_with_its_error(evaluator: Evaluator, text: str, said: str) -> None:
