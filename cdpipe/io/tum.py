@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import io
+from array import array
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,9 @@ from cdpipe.core.geometry.motion import Motion, make_motion
 TUM_LINE = "stamp tx ty tz qx qy qz qw"
 _UNIT_TOLERANCE = 1e-3
 _FARTHEST_M = 1e8  # around the Earth twice; UTM coordinates are below 1e7
-MOST_BYTES = 100_000_000  # two hours at 200 Hz
+_MOST_BYTES = 100_000_000
+_MOST_LINES = 1_500_000  # two hours at 200 Hz
+_LONGEST_LINE = 50_000  # letters; a pose with its covariances has 1,500
 _MOST_STAMP_S = 9e9  # of Unix time until the year 2255; as nanoseconds it fits into 64 bits
 # Poses farther apart than this say nothing about the columns between them.
 _LONGEST_GAP_S = 1.0
@@ -30,13 +34,12 @@ def read_tum(path: Path) -> tuple[Float64Array, tuple[int, ...]]:
     Raises:
         InputError: The file cannot be read, or a line is not eight finite numbers with a unit quaternion.
     """
-    content = read_bytes(path, MOST_BYTES)
-    try:
-        lines = content.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: cannot be read as text: {error}") from error
-    numbers = tuple(n for n, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith("#"))
-    rows = np.array([_row(f"{path}:{number}", lines[number - 1]) for number in numbers], np.float64).reshape(-1, 8)
+    values, numbers = array("d"), array("q")
+    for number, line in iterate_lines(path):
+        if not line.startswith("#"):
+            values.extend(_row(path, number, line))
+            numbers.append(number)
+    rows = np.array(values, np.float64).reshape(-1, 8)
     require_unit_poses(rows[:, 1:], lambda index: f"{path}:{numbers[index]}")
     is_stamp = np.abs(rows[:, 0]) < _MOST_STAMP_S  # NaN is none, either
     if not is_stamp.all():
@@ -44,7 +47,29 @@ def read_tum(path: Path) -> tuple[Float64Array, tuple[int, ...]]:
         raise InputError(
             f"{path}:{numbers[bad]}: the stamp is {rows[bad, 0]:g}: expected seconds below {_MOST_STAMP_S:g}"
         )
-    return rows, numbers
+    return rows, tuple(numbers)
+
+
+def iterate_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the numbered lines of a text file that are not empty, without the blanks around them.
+
+    Raises:
+        InputError: The file cannot be read, is no text, or is larger, has more lines or longer ones than poses need.
+    """
+    content = read_bytes(path, _MOST_BYTES)
+    try:
+        content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: cannot be read as text: {error}") from error
+    text = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig")
+    # a list of all lines would take twenty times the file
+    for number, line in enumerate(iter(lambda: text.readline(_LONGEST_LINE + 1), ""), start=1):
+        if len(line) > _LONGEST_LINE:
+            raise InputError(f"{path}:{number}: more than {_LONGEST_LINE} letters: expected one pose a line")
+        if number > _MOST_LINES:
+            raise InputError(f"{path}: more than {_MOST_LINES} lines: leave out poses between the scans")
+        if stripped := line.strip():
+            yield number, stripped
 
 
 def read_trajectory(path: Path) -> tuple[Float64Array, tuple[int, ...]]:
@@ -163,11 +188,12 @@ def are_poses(poses: Float64Array) -> BoolArray:
     return is_near & is_unit
 
 
-def _row(where: str, line: str) -> list[float]:
+def _row(path: Path, number: int, line: str) -> list[float]:
     words = line.split()
     if len(words) != 8:
-        raise InputError(f"{where}: {len(words)} fields: expected eight numbers, {TUM_LINE}; got {line.strip()[:60]!r}")
+        got = f"{len(words)} fields: expected eight numbers, {TUM_LINE}; got {line[:60]!r}"
+        raise InputError(f"{path}:{number}: {got}")
     try:
         return [float(word) for word in words]
     except ValueError as error:
-        raise InputError(f"{where}: expected eight numbers, {TUM_LINE}: {error}") from error
+        raise InputError(f"{path}:{number}: expected eight numbers, {TUM_LINE}: {error}") from error

@@ -26,6 +26,7 @@ _NO_POSE = {
 _PLACES = {"position", "pos", "translation", "trans", "pose", "p", "t"}
 _NO_PLACE = {"euler", "rpy", "imu", "mag", "magnetic", "gravity"}
 _OF_SOMETHING = 2
+MOST_COLUMNS = 1_000  # of a pose; with its covariances it has 100
 _CLOCKS = ("time", "sec", "nsec")
 
 
@@ -37,6 +38,8 @@ def is_header(words: Sequence[str], n_fields: int, *, has_commas: bool) -> bool:
         n_fields: Of the first line that is none.
         has_commas: Whether commas separate the words.
     """
+    if len(words) > MOST_COLUMNS:
+        return False
     columns = find_columns(words)
     if has_commas:
         return {"x", "y", "z"} <= set(columns)

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Sequence
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from cdpipe.core.errors import InputError, InputWarning
-from cdpipe.core.files import read_bytes
 from cdpipe.core.geometry import BoolArray, Float64Array, make_pose, travelled_m
 from cdpipe.core.geometry.motion import Motion, make_motion
-from cdpipe.io.foreign.columns import TIME_UNITS_S, find_columns, find_rivals, is_header
-from cdpipe.io.tum import MOST_BYTES, TUM_LINE, read_tum, require_unit_poses
+from cdpipe.io.foreign.columns import MOST_COLUMNS, TIME_UNITS_S, find_columns, find_rivals, is_header
+from cdpipe.io.tum import TUM_LINE, iterate_lines, read_tum, require_unit_poses
 
 # A pose is rigid if no entry of R R^T is farther than this from the identity; KITTI files have six digits.
 _RIGID = 1e-3
@@ -28,6 +29,7 @@ _SECONDS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # from this median on, st
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?")
 _RADIANS = np.pi + 1e-3  # rounded to three digits; angles up to here are taken for radians without a unit
 _DEGREES = 7.0  # from here on they are degrees
+_MOST_COMMENTS = 100  # before the first pose, that may be a header
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,21 +76,24 @@ def read_poses(path: Path) -> Trajectory:
             rise, or angles may be degrees or radians. Radians without a unit in the header are an `InputWarning`.
     """
     lines = _lines(path)
-    if not lines:
+    first = next(lines, None)
+    if first is None:
         raise InputError(f"{path}: no poses in it: expected lines `{TUM_LINE}`, KITTI's 12 numbers, or a CSV")
-    words = _split(lines[0][1])
-    if not all(map(_is_number, words)):
-        return _read_csv(path, words, lines[1:])
+    words = _split(first[1])
     columns = len(words)
-    if columns == 8 and "," not in lines[0][1] and ";" not in lines[0][1]:
+    if columns > MOST_COLUMNS:
+        raise InputError(f"{path}:{first[0]}: {columns} fields: expected at most {MOST_COLUMNS}")
+    if not all(map(_is_number, words)):
+        return _read_csv(path, words, lines)
+    if columns == 8 and "," not in first[1] and ";" not in first[1]:
         rows, _ = read_tum(path)
         return Trajectory(str(path), _from_quaternions(rows[:, 1:]), rows[:, 0], is_tum=True)
     if columns not in (7, 8, 12, 13):
         raise InputError(
-            f"{path}:{lines[0][0]}: {columns} fields: expected eight numbers, {TUM_LINE}; or KITTI's 12 numbers; or a "
+            f"{path}:{first[0]}: {columns} fields: expected eight numbers, {TUM_LINE}; or KITTI's 12 numbers; or a "
             "header that names the columns"
         )
-    rows, numbers = _numbers(path, lines, columns)
+    rows, numbers = _numbers(path, chain([first], lines), columns)
     has_time = columns in (8, 13)
     poses = _poses(path, rows[:, int(has_time) :], numbers)
     return Trajectory(str(path), poses, _rising(path, _seconds(rows[:, 0])) if has_time else None)
@@ -100,7 +105,7 @@ def read_times(path: Path) -> Float64Array:
     Raises:
         InputError: A line is not one finite number, or a time does not come after the one before it.
     """
-    lines = _lines(path)
+    lines = list(_lines(path))
     if all(_DATE.fullmatch(line) for _, line in lines):
         dates = np.array([_date(f"{path}:{number}", line) for number, line in lines], "datetime64[ns]")
         return _rising(path, dates.astype(np.int64) / 1e9)
@@ -188,20 +193,27 @@ def _period(time_s: Float64Array) -> float:
     return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
 
 
-def _lines(path: Path) -> list[tuple[int, str]]:
-    """Return the numbered lines of a text file that are neither empty nor, after the first, comments."""
-    try:
-        text = read_bytes(path, MOST_BYTES).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: cannot be read as text: {error}") from error
-    lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), start=1) if line.strip()]
-    # a header may begin as a comment does
-    n_comments = next((index for index, (_, line) in enumerate(lines) if not line.startswith("#")), len(lines))
-    n_fields = len(_split(lines[n_comments][1])) if n_comments < len(lines) else 0
-    header = [
-        each for each in lines[: n_comments + 1] if is_header(_split(each[1]), n_fields, has_commas="," in each[1])
-    ][:1]
-    return header + [each for each in lines if not each[1].startswith("#") and each not in header]
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the numbered lines of a text file that are neither empty nor, after the first, comments."""
+    lines = iterate_lines(path)
+    begin: list[tuple[int, str]] = []  # a header may begin as a comment does
+    first = None
+    for each in lines:
+        if not each[1].startswith("#"):
+            first = each
+            break
+        if len(begin) < _MOST_COMMENTS:
+            begin.append(each)
+    n_fields = 0
+    if first is not None:
+        begin.append(first)
+        n_fields = len(_split(first[1]))
+    header = next((each for each in begin if is_header(_split(each[1]), n_fields, has_commas="," in each[1])), None)
+    if header is not None:
+        yield header
+    if first is not None and first is not header:
+        yield first
+    yield from (each for each in lines if not each[1].startswith("#"))
 
 
 def _split(line: str) -> list[str]:
@@ -220,7 +232,7 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _read_csv(path: Path, names: list[str], lines: list[tuple[int, str]]) -> Trajectory:
+def _read_csv(path: Path, names: list[str], lines: Iterable[tuple[int, str]]) -> Trajectory:
     columns = find_columns(names)
     if rivals := find_rivals(names):
         raise InputError(f"{path}: positions may be those of {' or '.join(rivals)}: leave the other columns out")
@@ -284,10 +296,11 @@ def _are_degrees(path: Path, angles: Float64Array, names: Sequence[str]) -> bool
 
 
 def _numbers(
-    path: Path, lines: list[tuple[int, str]], columns: int, used: Sequence[int] | None = None
-) -> tuple[Float64Array, list[int]]:
+    path: Path, lines: Iterable[tuple[int, str]], columns: int, used: Sequence[int] | None = None
+) -> tuple[Float64Array, Sequence[int]]:
     """Return the finite numbers (N, U) in the used columns of lines, all without `used`, and their line numbers."""
-    rows = []
+    indices = range(columns) if used is None else used
+    values, numbers = array("d"), array("q")
     for number, line in lines:
         words = _split(line)
         if len(words) != columns:
@@ -295,15 +308,18 @@ def _numbers(
                 f"{path}:{number}: {len(words)} fields, {columns} in the first line: expected as many in each"
             )
         try:
-            row = [float(words[index] or "nan") for index in (range(columns) if used is None else used)]
+            values.extend([float(words[index] or "nan") for index in indices])
         except ValueError as error:
             raise InputError(f"{path}:{number}: expected numbers: {error}") from error
-        if not np.isfinite(row).all():
-            raise InputError(f"{path}:{number}: a number is missing or not finite: correct it or remove the line")
-        rows.append(row)
-    if not rows:
+        numbers.append(number)
+    if not numbers:
         raise InputError(f"{path}: no line of numbers in it")
-    return np.array(rows, np.float64), [number for number, _ in lines]
+    rows = np.array(values, np.float64).reshape(len(numbers), -1)
+    is_finite = np.isfinite(rows).all(axis=1)
+    if not is_finite.all():
+        bad = numbers[int(np.argmin(is_finite))]
+        raise InputError(f"{path}:{bad}: a number is missing or not finite: correct it or remove the line")
+    return rows, numbers
 
 
 def _poses(path: Path, rows: Float64Array, numbers: Sequence[int]) -> Float64Array:

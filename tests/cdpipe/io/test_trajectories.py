@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -15,6 +16,7 @@ pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
 from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.io.foreign import HowToRead, convert_recording, read_poses
 from cdpipe.io.readers import open_session
+from cdpipe.io.tum import read_tum
 from tests.cdpipe.io.foreign_files import (
     MADE,
     START_NS,
@@ -224,3 +226,34 @@ def test_the_unit_of_angles_is_that_of_the_header(tmp_path: Path) -> None:
     assert yaw_rad("", 90.0) == pytest.approx(np.pi / 2)
     with pytest.warns(InputWarning, match="are taken for radians"):
         assert yaw_rad("", 0.5) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1 " * 400_000, ":1: more than 50000 letters"),
+        ("0 0 0 0 0 0 0 1\n# " + "x," * 400_000, ":2: more than 50000 letters"),
+        (",".join(f"c{column}" for column in range(1_001)), ":1: 1001 fields: expected at most 1000"),
+        ("\n" * 1_500_001, ": more than 1500000 lines"),
+        ("#\n" * 1_500_001, ": more than 1500000 lines"),
+    ],
+)
+def test_a_file_that_no_trajectory_can_be_is_refused_early(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(text)
+    for read in (read_poses, read_tum):
+        if read is read_poses or "fields" not in said:
+            with pytest.raises(InputError) as caught:
+                read(path)
+            assert str(caught.value).startswith(f"{path}{said}") and "\n" not in str(caught.value)
+
+
+def test_reading_poses_takes_no_multiple_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text("0.123456789,0.123456789,0.123456789,0.000000000,0.000000000,0.000000000,1.0\n" * 50_000 + "1,2")
+    tracemalloc.start()
+    with pytest.raises(InputError, match=r":50001: 2 fields, 7 in the first line"):
+        read_poses(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * path.stat().st_size
