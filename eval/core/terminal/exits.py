@@ -45,6 +45,10 @@ def input_errors() -> Iterator[None]:
         what = visible(f"{error.filename2 or error.filename or unnamed}: {error.strerror}")
         sys.stderr.write(f"error: {what}: {way}\n")
         raise SystemExit(2) from error
+    except MemoryError as error:  # numpy's says how much was asked for
+        said = visible(" ".join(str(error).split())) or "no more can be had"
+        sys.stderr.write(f"error: more memory is needed than there is ({said}): give it smaller inputs\n")
+        raise SystemExit(2) from error
 
 
 def run_program(command: Callable[..., None], module: str) -> NoReturn:

@@ -40,6 +40,15 @@ def test_a_disk_that_fails_is_told_in_one_line(number: int, capsys: pytest.Captu
         assert told.count("\n") == 1
 
 
+def test_memory_that_runs_out_is_told_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    for error in (MemoryError(), MemoryError("Unable to allocate 33.1 TiB\nfor an array")):
+        with pytest.raises(SystemExit) as caught, input_errors():
+            raise error
+        assert caught.value.code == 2
+        told = capsys.readouterr().err
+        assert told.startswith("error: more memory is needed than there is (") and told.count("\n") == 1
+
+
 def test_any_other_error_of_the_system_is_a_bug() -> None:
     with pytest.raises(ConnectionResetError), input_errors():
         raise ConnectionResetError(errno.ECONNRESET, "reset")
