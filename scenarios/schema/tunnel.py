@@ -10,6 +10,7 @@ from cdpipe.core.yamlfile import GrownSettings, Settings
 from scenarios.schema.values import Finite, NotNegative, Positive, Reflectivity, Share, Side, SignedShare
 
 FARTHEST_M = 20_000.0  # of rock from the origin: MuJoCo keeps vertices in float32, in steps of 2 mm there
+Across = Annotated[float, Field(gt=0, le=100)]  # the widest caverns in use are 60 m across
 _FINEST_SHARE = 0.25  # of a cell of the mesh; rock that is rougher on a shorter length is not drawn, and fills memory
 
 
@@ -17,8 +18,8 @@ class Section(Settings):
     """Cross-section of a drift at its nominal size; in a foreign mesh about how wide and high its drifts are."""
 
     shape: Literal["horseshoe", "d", "arch", "rectangle", "cave"] = "horseshoe"
-    width_m: Positive = 5.0
-    height_m: Positive = 4.0
+    width_m: Across = 5.0
+    height_m: Across = 4.0
 
 
 class Variation(Settings):
@@ -46,7 +47,7 @@ class Ruts(Settings):
 class Stones(Settings):
     """Loose fragments on the floor, sizes after Rosin-Rammler, smaller ones left out."""
 
-    per_m2: NotNegative
+    per_m2: Annotated[float, Field(ge=0, le=100)]
     size_m: Positive = 0.12  # characteristic size
     max_size_m: Positive = 0.35
 
@@ -73,9 +74,9 @@ class Niche(Settings):
     between: tuple[str, str]
     fraction: Share
     side: Side
-    width_m: Positive
-    depth_m: Positive
-    height_m: Positive
+    width_m: Across
+    depth_m: Across
+    height_m: Across
 
 
 class Pipe(Settings):
@@ -104,14 +105,14 @@ class CableTray(Settings):
 class Bolts(Settings):
     """Rock bolts with plates, in a square pattern over roof and upper walls."""
 
-    spacing_m: Positive = 1.2
+    spacing_m: Annotated[float, Field(ge=0.1, allow_inf_nan=False)] = 1.2
 
 
 class Screen(Settings):
     """Welded wire mesh on roof and shoulders, in panels."""
 
     share: Share = 1.0  # of the length of every drift
-    opening_m: Positive = 0.1
+    opening_m: Annotated[float, Field(ge=0.01, allow_inf_nan=False)] = 0.1
 
 
 class Markers(Settings):
@@ -160,7 +161,7 @@ class Tunnel(Settings):
     meander_m: NotNegative = 0.0  # amplitude of the sideways wander of every centreline
     meander_length_m: Positive = 25.0
     furniture: Furniture = Furniture()
-    resolution_m: Positive = 0.15  # edge of the marching-cubes cell
+    resolution_m: Annotated[float, Field(ge=0.01, allow_inf_nan=False)] = 0.15  # edge of the marching-cubes cell
     reflectivity: Reflectivity = 0.25
 
     @model_validator(mode="after")

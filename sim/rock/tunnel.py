@@ -14,11 +14,36 @@ from cdpipe.core.geometry import Float64Array, Int64Array
 from scenarios.schema import Tunnel
 from sim.geometry.mesh import Mesh, drop_flat_faces, drop_unused_vertices
 from sim.geometry.rows import number_rows, unique_rows
-from sim.rock.centreline import Centreline
+from sim.rock.centreline import STEP_M, Centreline
 from sim.rock.field import Field
 
 _BLOCK_CELLS = 48
+_MOST_VERTICES = 15_000_000  # as many as a foreign mesh may have
+_MOST_CELLS = 500_000_000  # 10 km of a drift of 8 m by 6 m have 140 million of 0.15 m
+_MOST_STONES = 500_000
 _SMALL_PART = 0.02  # share of the largest piece's faces below which a piece is a bubble or a floating stone
+
+
+def require_buildable(tunnel: Tunnel, centreline: Centreline) -> None:
+    """Raise `ScenarioError` if the walls, or the stones on the floor, would be more than memory holds."""
+    floor_m2 = rock_m2 = void_m3 = 0.0
+    for line in centreline.drifts:
+        length_m, width_m, height_m = len(line.points) * STEP_M, line.section.width_m, line.section.height_m
+        floor_m2 += length_m * width_m
+        void_m3 += length_m * width_m * height_m
+        rock_m2 += 2 * (length_m * (width_m + height_m) + width_m * height_m)
+    finest_m = max((rock_m2 / _MOST_VERTICES) ** 0.5, (void_m3 / _MOST_CELLS) ** (1 / 3))
+    if tunnel.mesh is None and tunnel.resolution_m < finest_m:
+        raise ScenarioError(
+            f"tunnel.resolution_m = {tunnel.resolution_m:g}: too fine for drifts of {rock_m2:.0f} m2 of rock and "
+            f"{void_m3:.0f} m3 (nodes, section.width_m, section.height_m): at least {finest_m * 1.01:.2g}"
+        )
+    stones = tunnel.floor.stones
+    if stones is not None and stones.per_m2 * floor_m2 > _MOST_STONES:
+        raise ScenarioError(
+            f"tunnel.floor.stones.per_m2 = {stones.per_m2:g}: {stones.per_m2 * floor_m2:.2g} stones on {floor_m2:.2g} "
+            f"m2 of floor: at most {_MOST_STONES / floor_m2:.2g}"
+        )
 
 
 def mesh_tunnel(tunnel: Tunnel, centreline: Centreline, seed: int) -> Mesh:

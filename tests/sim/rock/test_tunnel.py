@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -8,11 +9,12 @@ from pydantic import ValidationError
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array
-from scenarios.schema import Drift, Floor, MeshFile, Niche, Roughness, Ruts, Section, Tunnel, Variation
+from scenarios.schema import Drift, Floor, MeshFile, Niche, Roughness, Ruts, Section, Stones, Tunnel, Variation
+from scenarios.schema.tunnel import Bolts, Screen
 from sim.geometry.mesh import Mesh
 from sim.geometry.raycast import Caster
 from sim.rock.centreline import Centreline, build_centreline, left_of
-from sim.rock.tunnel import mesh_tunnel
+from sim.rock.tunnel import mesh_tunnel, require_buildable
 
 SEED = 3
 
@@ -326,6 +328,35 @@ def test_bad_tunnels_are_refused() -> None:
     double = Tunnel(nodes={"a": (0, 0, 0), "b": (1, 0, 0)}, drifts=(Drift(nodes=("a", "b")),), section=section)
     with pytest.raises(ScenarioError, match=r"'a' and 'b' .*1\.00 m"):
         build_centreline(double, 0)
+
+
+def test_a_tunnel_that_memory_cannot_hold_is_refused_before_it_is_built() -> None:
+    section = Section(width_m=8.0, height_m=6.0)
+    nodes = {"a": (-5_000, 0, 0), "b": (5_000, 0, 0)}
+    long = Tunnel(nodes=nodes, drifts=(Drift(nodes=("a", "b")),), section=section, resolution_m=0.15)
+    line = build_centreline(long, SEED)
+    require_buildable(long, line)  # 10 km are not too much
+    with pytest.raises(ScenarioError, match=r"resolution_m = 0\.05: too fine .*section\.width_m.*at least 0\.1"):
+        require_buildable(long.model_copy(update={"resolution_m": 0.05}), line)
+    stony = long.model_copy(update={"floor": Floor(stones=Stones(per_m2=50.0))})
+    with pytest.raises(ScenarioError, match=r"per_m2 = 50: 4e\+06 stones on 8e\+04 m2 of floor: at most 6\.2"):
+        require_buildable(stony, line)
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: Section(width_m=1e5),
+        lambda: Section(height_m=101),
+        lambda: Stones(per_m2=1e12),
+        lambda: straight(Section(), resolution_m=1e-4),
+        lambda: Bolts(spacing_m=1e-6),
+        lambda: Screen(opening_m=1e-6),
+    ],
+)
+def test_sizes_that_no_tunnel_has_are_refused(build: Callable[[], object]) -> None:
+    with pytest.raises(ValidationError, match="Input should be"):
+        build()
 
 
 def test_a_drift_that_comes_to_a_node_twice_has_its_edges_in_order() -> None:
