@@ -19,6 +19,7 @@ if sys.platform != "win32":
 
 _FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LONGEST_BYTES = 255  # of a name, which file systems take
+_MOST_CLAIMS = 100
 
 
 @contextmanager
@@ -127,13 +128,15 @@ def hold(folder: Path) -> int | None:
 
 def _claim(partial: Path) -> int | None:
     """Hold the hidden folder of that name; make it unless it is there."""
-    partial.parent.mkdir(parents=True, exist_ok=True)
-    while True:
+    for _ in range(_MOST_CLAIMS):
+        partial.parent.mkdir(parents=True, exist_ok=True)  # another that is refused may remove them
         try:
             partial.mkdir()
         except FileExistsError:
             if partial.is_symlink() or partial.is_file():
                 raise
+        except FileNotFoundError:
+            continue
         except KeyboardInterrupt:
             with suppress(OSError):
                 partial.rmdir()
@@ -147,6 +150,8 @@ def _claim(partial: Path) -> int | None:
         # meanwhile its holder has renamed or removed it, and a lock on that excludes nobody
         if handle is not None:
             os.close(handle)
+    # a network disk may tell other numbers of an open folder than of its name
+    raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK), str(partial))
 
 
 def _is_held(handle: int | None, folder: Path) -> bool:

@@ -64,7 +64,7 @@ def iterate_lines(path: Path) -> Iterator[tuple[int, str]]:
     text = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig")
     # a list of all lines would take twenty times the file
     for number, line in enumerate(iter(lambda: text.readline(_LONGEST_LINE + 1), ""), start=1):
-        if len(line) > _LONGEST_LINE:
+        if len(line.rstrip("\n")) > _LONGEST_LINE:
             raise InputError(f"{path}:{number}: more than {_LONGEST_LINE} letters: expected one pose a line")
         if number > _MOST_LINES:
             raise InputError(f"{path}: more than {_MOST_LINES} lines: leave out poses between the scans")

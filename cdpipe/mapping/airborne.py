@@ -101,9 +101,10 @@ def returns_around(
     seen = [(poses[index], cleared.scan(index).airborne_sensor) for index in dusty.tolist()]
     places = np.concatenate([transform(pose, dropped) for pose, dropped in seen if dropped is not None])
     steps = _AROUND_M * np.array(list(product((-1, 0, 1), repeat=3)))
-    around = np.unique(np.concatenate([cell_keys(places + step, _AROUND_M) for step in steps]))
+    middles = cell_corners(np.unique(cell_keys(places, _AROUND_M)), _AROUND_M) + _AROUND_M / 2
+    around = np.unique(np.concatenate([cell_keys(middles + step, _AROUND_M) for step in steps]))
     reach_m = config.max_range_m + _AROUND_M * 3
-    near, _ = cKDTree(places).query(poses[:, :3, 3], distance_upper_bound=reach_m)
+    near, _ = cKDTree(middles).query(poses[:, :3, 3], distance_upper_bound=reach_m)
     for index in np.flatnonzero(np.isfinite(near)).tolist():
         scan = posed.scan(index)
         is_within = np.einsum("ij,ij->i", scan.points_sensor, scan.points_sensor) <= config.max_range_m**2

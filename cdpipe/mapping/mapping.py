@@ -46,8 +46,8 @@ def build_map(
     order does not depend on `batch_scans`.
 
     Args:
-        source: The session, read in order: once as it is; before, where poses are made consistent or returns of mist
-            or dust are left out (`ClearScans`); again, where there were many of those.
+        source: The session, read in order: once as it is; before, where poses are made consistent; again, where
+            returns of mist or dust were left out (`ClearScans`) of many scans, or poses stay as they are.
         config: Voxel size, longest range, keyframe spacing, and what is made consistent and left out.
         batch_scans: Scans held in memory at a time.
         on_step: Told how many scans were registered while poses are made consistent.
@@ -61,14 +61,17 @@ def build_map(
     cleared, consistent = source, None
     if config.consistency != "none":
         source = consistent = make_consistent(source, has_loops=config.consistency == "graph", on_step=on_step)
+    # dusty scans are known once all were read: to make poses consistent, or for a first map
+    point_map = _accumulate(source, keyframe_scans, config, batch_scans) if consistent is None else None
     if isinstance(cleared, ClearScans) and len(dusty := cleared.find_dusty()):
         if len(dusty) <= FEW_SCANS * len(source.odom_T_sensor):
             returns = returns_around(cleared, dusty, source, config)
         else:
-            returns = returns_of(_accumulate(source, keyframe_scans, config, batch_scans))
-        supported = cleared.supported_by(returns, source.odom_T_sensor)
+            returns = returns_of(point_map or _accumulate(source, keyframe_scans, config, batch_scans))
+        supported, point_map = cleared.supported_by(returns, source.odom_T_sensor), None
         source = supported if consistent is None else consistent.over(supported)
-    point_map = _accumulate(source, keyframe_scans, config, batch_scans)
+    if point_map is None:
+        point_map = _accumulate(source, keyframe_scans, config, batch_scans)
     point_map = replace(point_map, recorded_T_sensor=recorded_T_sensor)
     return drop_movers(point_map) if config.movers == "drop" else point_map
 

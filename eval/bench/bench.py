@@ -33,7 +33,7 @@ from sim.studies.timing import Contest, SkippedContest, timed
 
 Contests = Mapping[str, Callable[[], Contest]]
 Row = dict[str, Any]
-_HEAD = b'{\n "machine": {'
+_HEAD = b'"machine": {'
 _SPHERE_LIMIT_S = 0.003
 _SCAN_LIMIT_S = 0.1  # a 10 Hz sensor
 _N_REGIONS = 3

@@ -182,7 +182,7 @@ def _tell_split(group: Sequence[CheckedFile]) -> Iterator[str]:
     split = find_split(seeds, [each.content.split for each in group])
     if split != "dev":
         first, last = min(seeds), max(seeds)
-        yield split or f"{f'seed {first}' if first == last else f'seeds {first} to {last}'} of no split"
+        yield split or f"{f'seed {first}' if first == last else f'seeds {first} to {last}'} of no test split"
 
 
 def take_rows(each: CheckedFile) -> pd.DataFrame:

@@ -32,11 +32,14 @@ def require_buildable(tunnel: Tunnel, centreline: Centreline) -> None:
         floor_m2 += length_m * width_m
         void_m3 += length_m * width_m * height_m
         rock_m2 += 2 * (length_m * (width_m + height_m) + width_m * height_m)
+    for niche in centreline.recesses:
+        void_m3 += niche.width_m * niche.back_m * niche.height_m
+        rock_m2 += 2 * niche.back_m * (niche.width_m + niche.height_m) + niche.width_m * niche.height_m
     finest_m = max((rock_m2 / _MOST_VERTICES) ** 0.5, (void_m3 / _MOST_CELLS) ** (1 / 3))
     if tunnel.mesh is None and tunnel.resolution_m < finest_m:
         raise ScenarioError(
             f"tunnel.resolution_m = {tunnel.resolution_m:g}: too fine for drifts of {rock_m2:.0f} m2 of rock and "
-            f"{void_m3:.0f} m3 (nodes, section.width_m, section.height_m): at least {finest_m * 1.01:.2g}"
+            f"{void_m3:.0f} m3 (nodes, section.width_m, section.height_m, niches): at least {finest_m * 1.01:.2g}"
         )
     stones = tunnel.floor.stones
     if stones is not None and stones.per_m2 * floor_m2 > _MOST_STONES:

@@ -15,22 +15,22 @@ from cdpipe.io.foreign.sniff import guess_format
 
 
 def share_topics(paths: Sequence[Path], hows: Sequence[HowToRead]) -> list[HowToRead]:
-    """Return how to read recordings, each bag with the topics that it holds; what none holds stays named for all.
+    """Return how to read recordings, each bag with the topics that it holds.
+
+    What none holds stays named for all, and so does everything for a bag that holds none of it: it is then refused.
 
     Raises:
         InputError: A bag cannot be read.
     """
-    named = [(path, how) for path, how in zip(paths, hows, strict=True) if how.topics]
-    bags = {path for path, how in named if (how.format or guess_format(path)) == "bag"}
+    told = list(zip(paths, hows, strict=True))
+    bags = {path for path, how in told if how.topics and (how.format or guess_format(path)) == "bag"}
     if len(bags) < 2:
         return list(hows)
     held = {path: _list_topics(path) for path in bags}
     some = set().union(*held.values())
     of_others = {path: some - own for path, own in held.items()}
-    return [
-        replace(how, topics=tuple(name for name in how.topics if name not in of_others.get(path, ())))
-        for path, how in zip(paths, hows, strict=True)
-    ]
+    kept = [tuple(name for name in how.topics if name not in of_others.get(path, ())) for path, how in told]
+    return [replace(how, topics=names or how.topics) for how, names in zip(hows, kept, strict=True)]
 
 
 def _list_topics(path: Path) -> set[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from array import array
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -29,7 +30,7 @@ _SECONDS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # from this median on, st
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?")
 _RADIANS = np.pi + 1e-3  # rounded to three digits; angles up to here are taken for radians without a unit
 _DEGREES = 7.0  # from here on they are degrees
-_MOST_COMMENTS = 100  # before the first pose, that may be a header
+_MOST_COMMENTS = 100  # right before the first pose, that may be a header
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -196,19 +197,17 @@ def _period(time_s: Float64Array) -> float:
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield the numbered lines of a text file that are neither empty nor, after the first, comments."""
     lines = iterate_lines(path)
-    begin: list[tuple[int, str]] = []  # a header may begin as a comment does
+    # a header may begin as a comment does; it stands near the poses
+    begin: deque[tuple[int, str]] = deque(maxlen=_MOST_COMMENTS)
     first = None
     for each in lines:
         if not each[1].startswith("#"):
             first = each
             break
-        if len(begin) < _MOST_COMMENTS:
-            begin.append(each)
-    n_fields = 0
-    if first is not None:
-        begin.append(first)
-        n_fields = len(_split(first[1]))
-    header = next((each for each in begin if is_header(_split(each[1]), n_fields, has_commas="," in each[1])), None)
+        begin.append(each)
+    n_fields = 0 if first is None else len(_split(first[1]))
+    may_be = begin if first is None else [*begin, first]
+    header = next((each for each in may_be if is_header(_split(each[1]), n_fields, has_commas="," in each[1])), None)
     if header is not None:
         yield header
     if first is not None and first is not header:

@@ -228,6 +228,19 @@ def test_the_unit_of_angles_is_that_of_the_header(tmp_path: Path) -> None:
         assert yaw_rad("", 0.5) == pytest.approx(0.5)
 
 
+def test_a_header_right_before_the_poses_holds_behind_many_comments(tmp_path: Path) -> None:
+    path = tmp_path / "t.txt"
+    path.write_text("# note\n" * 300 + "# time x y z qw qx qy qz\n0 1 2 3 1 0 0 0\n1 1 2 4 1 0 0 0\n")
+    found = read_poses(path)
+    np.testing.assert_allclose(found.poses[0][:3, :3], np.eye(3), atol=1e-12)
+
+
+def test_the_longest_line_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "t.txt"
+    path.write_text("0 0 0 0 0 0 0 1\n" + ("#" + "x" * 49_999 + "\n") * 2 + "1 0 0 0 0 0 0 1\n")
+    assert len(read_tum(path)[0]) == 2
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

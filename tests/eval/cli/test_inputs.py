@@ -99,6 +99,8 @@ def test_two_bags_may_name_their_clouds_differently(tmp_path: Path, command: Com
 
     assert topics_of("/a/points", "/b/points") == topics_of("/b/points", "/a/points") == ["/a/points", "/b/points"]
     assert topics_of(shared) == [shared, shared]
+    # what one of them alone holds is asked of the other, too, which is refused: it has another cloud
+    assert topics_of("/a/points") == ["/a/points", "/a/points"]
     both = ("--topic", "/a/points", "--topic", "/b/points", "--out", tmp_path / "out")
     _, _, err = command("detect", *paths, *both)
     assert "--topic" not in err and "topics of PointCloud2" not in err

@@ -379,10 +379,10 @@ def test_the_page_shows_every_file_escaped(packed: Path, tmp_path: Path) -> None
         ((20000, 20999), "sealed by tunnelcd 0.3.0", ""),
         (seal_seeds((20000, 20005), "tunnelcd 0.2.0"), "sealed by tunnelcd 0.2.0", ", sealed by tunnelcd 0.2.0"),
         (seal_seeds((20000, 20005), version_name()), "", f", sealed by {version_name()}"),
-        (seal_seeds((20000, 20005), "tunnelcd 0.2.0"), "sealed by tunnelcd 0.1.0", ", seeds {} to {} of no split"),
-        ((40000, 40001), "sealed by tunnelcd 99.0.0", ", seeds {} to {} of no split"),
-        ((40000, 40001), "sealed by <b>", ", seeds {} to {} of no split"),
-        ((10000, 10001), "", ", seeds {} to {} of no split"),
+        (seal_seeds((20000, 20005), "tunnelcd 0.2.0"), "sealed by tunnelcd 0.1.0", ", seeds {} to {} of no test split"),
+        ((40000, 40001), "sealed by tunnelcd 99.0.0", ", seeds {} to {} of no test split"),
+        ((40000, 40001), "sealed by <b>", ", seeds {} to {} of no test split"),
+        ((10000, 10001), "", ", seeds {} to {} of no test split"),
     ],
 )
 def test_the_split_is_that_of_the_seeds_whatever_is_claimed(

@@ -50,6 +50,6 @@ def test_the_documented_scripts_get_from_a_plan_to_the_page(
     code, _, err = command("leaderboard", "told.zip", "template.zip", "--out", "board.html")
     assert code == 0, err
     page = Path("board.html").read_text()
-    told = "1 pair, seed 10600 of no split<"  # a seed for validation
+    told = "1 pair, seed 10600 of no test split<"  # a seed for validation
     assert f"Plan two, in distribution, {told}" in page and f"Plan two, out of distribution, {told}" in page
     assert f"Plan one, {told}" in page

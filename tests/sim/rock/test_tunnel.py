@@ -338,6 +338,10 @@ def test_a_tunnel_that_memory_cannot_hold_is_refused_before_it_is_built() -> Non
     require_buildable(long, line)  # 10 km are not too much
     with pytest.raises(ScenarioError, match=r"resolution_m = 0\.05: too fine .*section\.width_m.*at least 0\.1"):
         require_buildable(long.model_copy(update={"resolution_m": 0.05}), line)
+    niche = Niche(between=("a", "b"), fraction=0.5, side="left", width_m=100, depth_m=100, height_m=5)
+    hall = long.model_copy(update={"niches": (niche,) * 40})
+    with pytest.raises(ScenarioError, match=r"resolution_m = 0\.15: too fine .*niches\): at least"):
+        require_buildable(hall, build_centreline(hall, SEED))
     stony = long.model_copy(update={"floor": Floor(stones=Stones(per_m2=50.0))})
     with pytest.raises(ScenarioError, match=r"per_m2 = 50: 4e\+06 stones on 8e\+04 m2 of floor: at most 6\.2"):
         require_buildable(stony, line)
