@@ -159,7 +159,8 @@ def motion_through(time_s: Float64Array, poses: Float64Array) -> Motion:
 def moved_m(poses: Float64Array, found: Float64Array) -> Float64Array:
     """Return the (N,) shifts from (N, 4, 4) poses to others, or what turns move at a wall where that is more."""
     motions = invert(poses) @ found
-    turns_rad = Rotation.from_matrix(motions[:, :3, :3]).magnitude()
+    # scipy 1.14 refuses to make no rotation at all
+    turns_rad = Rotation.from_matrix(motions[:, :3, :3]).magnitude() if len(motions) else np.zeros(0)
     return np.asarray(np.maximum(np.linalg.norm(motions[:, :3, 3], axis=1), _WALL_M * turns_rad))
 
 

@@ -511,7 +511,7 @@ def test_an_interrupt_elsewhere_leaves_nothing_half_written(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(making, "simulate_pair", interrupted)
+    monkeypatch.setattr(making, "write_pair", interrupted)
     assert command("simulate", "smoke/one_box", "--out", tmp_path / "out", "--quiet") == (
         130, "", "interrupted; nothing half-written is left\n",
     )  # fmt: skip

@@ -76,6 +76,8 @@ def test_three_revolutions_of_an_os1_128(command: Callable[..., Any], tmp_path: 
     assert score(detect(null / "before", null / "after", "every-keyframe", FEW), null)["n_false_regions"] == 0
 
 
+# with KISS-ICP 1.2 too few points of eight beams fit around the true merge, and it says so
+@pytest.mark.filterwarnings("ignore:known merge")
 def test_ten_revolutions_of_an_os0_8(command: Callable[..., Any], tmp_path: Path) -> None:
     pytest.importorskip("ouster.sdk", reason="pip install 'tunnelcd[ouster]'")
     pytest.importorskip("kiss_icp", reason="pip install 'tunnelcd[odometry]'")
