@@ -28,16 +28,16 @@ from sim.session.revolution import Drive
 RECORDING = "OS-1-32-G_v2.1.1_1024x10"
 
 
-def find_recording(folder: Path | None) -> Path:
-    """Return the path of the real revolution's PCAP below a folder, its metadata beside it.
+def find_recording(folder: Path | None, name: str = RECORDING) -> Path:
+    """Return the path of a real revolution's PCAP below a folder, its metadata beside it.
 
     Raises:
         InputError: No folder is given, or it does not hold the two files.
     """
-    wanted = f"{RECORDING}.pcap and {RECORDING}.json (both from the vendor's SDK repository, BSD-3)"
+    wanted = f"{name}.pcap and {name}.json (both from the vendor's SDK repository, BSD-3)"
     if folder is None:
         raise InputError(f"no real recording: give --data or set TUNNELCD_REAL_DATA to a folder with {wanted}")
-    for path in (folder / f"{RECORDING}.pcap", folder / "ouster" / f"{RECORDING}.pcap"):
+    for path in (folder / f"{name}.pcap", folder / "ouster" / f"{name}.pcap"):
         if path.is_file() and path.with_suffix(".json").is_file():
             return path
     raise InputError(f"{folder}: no real recording in it: expected {wanted}, there or in its folder ouster")
