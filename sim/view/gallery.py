@@ -7,8 +7,9 @@ python -m sim.view.gallery OUT narrow box only these
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -20,13 +21,16 @@ from cdpipe.core.errors import ScenarioError
 from cdpipe.core.geometry import Float64Array, stream, yaw_pose, yaw_rad
 from cdpipe.core.yamlfile import suggest
 from scenarios import load_scenario, scenario_names
-from scenarios.schema import Drift, Place, Prop, Roughness, Scenario, Section, SessionPlan, Tunnel
+from scenarios.schema import Air, Drift, Place, Prop, Roughness, Scenario, Section, SessionPlan, Tunnel
 from sim.displacement.displace import Displacement
 from sim.geometry.mesh import move_mesh
 from sim.geometry.raycast import Caster
+from sim.movers.trails import raise_dust
 from sim.placement.placing import Posture, Standing, standing_box, standing_middle
 from sim.scene import WALL_GEOM, Scene, World, build_world
+from sim.sensor.air import AirVolume, air_around
 from sim.session.planning import plan_drives
+from sim.session.revolution import Drive
 from sim.view.picture import render
 from sim.view.rock import STEPS_M, face_tints
 
@@ -106,19 +110,25 @@ def family_picture(scenario: Scenario, seed: int) -> Pixels:
     """Return a picture of a world in the after session, from the place that shows most of the changes.
 
     With movers or puddles it shows most of these, movers where they are in the middle of the session. Rock that moved
-    is coloured by its displacement.
+    is coloured by its displacement. Mist and dust are those of the middle of the session.
     """
     world = build_world(scenario, seed)
-    if scenario.movers or scenario.puddles:
-        scene, places = _with_guests(scenario, seed)
-        return _best_view(world, scene, places, set(range(_FIRST_GUEST, _FIRST_GUEST + len(places))), nearest_m=5.0)
+    if scenario.movers or scenario.puddles or scenario.after.air is not None:
+        drive = plan_drives(scenario, seed)[1]
+        air = partial(_air_at, drive)
+        if scenario.movers or scenario.puddles:
+            scene, places = _with_guests(drive)
+            guests = set(range(_FIRST_GUEST, _FIRST_GUEST + len(places)))
+            return _best_view(world, scene, places, guests, nearest_m=5.0, air_at=air)
+    else:
+        air = None
     if world.displacement is not None:
         return _best_view(world, world.after, _rock_places(world.displacement), set(), nearest_m=4.0)
     changed = [item for item in world.standing if item.prop.change != "none" and "after" in item.sessions]
     # a little above a low prop, so that walls and roof come into the picture
     targets = [standing_middle(item) + np.array([0.0, 0.0, 0.6]) for item in changed or world.standing]
     numbers = {prop.name: number for number, prop in enumerate(scenario.props, start=1)}
-    return _best_view(world, world.after, targets, {numbers[item.prop.name] for item in changed})
+    return _best_view(world, world.after, targets, {numbers[item.prop.name] for item in changed}, air_at=air)
 
 
 def _rock_places(displacement: Displacement) -> list[Float64Array]:
@@ -128,13 +138,16 @@ def _rock_places(displacement: Displacement) -> list[Float64Array]:
     return [walls.after[each].mean(axis=(0, 1)) for each in faces]
 
 
-def _with_guests(scenario: Scenario, seed: int) -> tuple[Scene, list[Float64Array]]:
-    """Return the after session's scene with its movers and puddles, and a place to look at of each, (3,).
+def _air_at(drive: Drive, eye_m: Float64Array) -> AirVolume:
+    """Return the mist and dust around an eye (3,) in the middle of a session."""
+    middle_s = float(drive.trajectory.revolution_s[drive.trajectory.n_scans // 2])
+    puffs = raise_dust(drive.moving.movers, middle_s)
+    air = drive.scenario.plan(drive.session).air or Air()
+    return air_around(air, eye_m, float(eye_m[2]) - _EYE_M, middle_s, drive.seed, drive.session, puffs)
 
-    Raises:
-        ScenarioError: A mover finds no way.
-    """
-    drive = plan_drives(scenario, seed)[1]
+
+def _with_guests(drive: Drive) -> tuple[Scene, list[Float64Array]]:
+    """Return a session's scene with its movers and puddles, and a place to look at of each, (3,)."""
     middle_s = drive.trajectory.revolution_s[[drive.trajectory.n_scans // 2]]
     pools = drive.water.pools if drive.water is not None else ()
     guests = [([pool.sheet()], ["water"], pool.centre) for pool in pools]
@@ -158,7 +171,12 @@ def _with_guests(scenario: Scenario, seed: int) -> tuple[Scene, list[Float64Arra
 
 
 def _best_view(
-    world: World, scene: Scene, targets: Sequence[Float64Array], wanted: set[int], nearest_m: float = 3.0
+    world: World,
+    scene: Scene,
+    targets: Sequence[Float64Array],
+    wanted: set[int],
+    nearest_m: float = 3.0,
+    air_at: Callable[[Float64Array], AirVolume] | None = None,
 ) -> Pixels:
     """Return a picture of a scene towards one of some places (3,), from where most of the wanted objects are seen.
 
@@ -176,7 +194,8 @@ def _best_view(
         eyes = stations[(distance_m > nearest_m) & (distance_m < nearest_m + 6.0)]
         views += [(eye, target, _score(scene, eye, target, wanted, label)) for eye in eyes]
     eye, target, _ = max(views, key=lambda view: view[2])
-    return render(scene, eye, target, *_FAMILY_PX, field_of_view_deg=78.0, samples=2, tints=tints)
+    air = None if air_at is None else air_at(eye)
+    return render(scene, eye, target, *_FAMILY_PX, field_of_view_deg=78.0, samples=2, tints=tints, air=air)
 
 
 def prop_pictures(kind: str) -> list[tuple[Pixels, str]]:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from cdpipe.core.geometry import Float32Array, Float64Array, stream
 from sim.scene import WALL_GEOM, Scene
+from sim.sensor.air import AirVolume
 
 COLOURS: dict[str, tuple[float, float, float]] = {
     "rock": (0.50, 0.47, 0.43),
@@ -29,6 +30,8 @@ _LAMP_RADIUS_M = 0.05
 _OCCLUSION_RAYS = 4
 _OCCLUSION_M = 1.2
 _CHUNK = 300_000
+_AIR_COLOUR = (0.66, 0.61, 0.54)
+_AIR_STEP_M, _AIR_REACH_M = 0.5, 60.0
 
 
 def render(
@@ -40,6 +43,7 @@ def render(
     field_of_view_deg: float = 70.0,
     samples: int = 1,
     tints: Float64Array | None = None,
+    air: AirVolume | None = None,
 ) -> npt.NDArray[np.uint8]:
     """Return a picture (height, width, 3) of a scene.
 
@@ -52,6 +56,7 @@ def render(
         field_of_view_deg: Horizontal.
         samples: Rays across and down each pixel; more rays smooth edges and shadows.
         tints: (M, 3) linear RGB colour of every face of the walls, NaN for the colour of rock; None for rock alone.
+        air: Mist and dust, which dim what lies behind them and shine in the lamp; None for clear air.
     """
     eye_m = np.asarray(eye, dtype=np.float64)
     forward, right, down = _axes(np.asarray(target, dtype=np.float64) - eye_m)
@@ -67,6 +72,13 @@ def render(
     generator = stream(0, "picture")
     chunks = np.split(directions, range(_CHUNK, len(directions), _CHUNK))
     light = np.concatenate([_shaded(scene, eye_m, lamp_m, chunk, colours, generator, tints) for chunk in chunks])
+    if air is not None:
+        light = np.concatenate(
+            [
+                _through_air(scene, eye_m, lamp_m, chunk, behind, air)
+                for chunk, behind in zip(chunks, np.split(light, range(_CHUNK, len(light), _CHUNK)), strict=True)
+            ]
+        )
     pixels = light.reshape(height, samples, width, samples, 3).mean(axis=(1, 3))
     return np.asarray(np.clip(pixels, 0.0, 1.0) ** (1 / 2.2) * 255, dtype=np.uint8)
 
@@ -116,6 +128,30 @@ def _shaded(
         own[wall] = np.where(np.isfinite(tint), tint, own[wall])
     light[seen] = own * (1.9 * lamp + 0.6 * around**1.4 * fog)[:, None]
     return light
+
+
+def _through_air(
+    scene: Scene,
+    eye_m: Float64Array,
+    lamp_m: Float64Array,
+    directions: Float64Array,
+    light: Float64Array,
+    air: AirVolume,
+) -> Float64Array:
+    """Return the light (N, 3) of each direction through the air: Beer-Lambert on the way to the eye, one scattering."""
+    ranges_m = np.minimum(scene.caster.cast(eye_m, directions)[0], _AIR_REACH_M)
+    left = np.ones(len(directions))
+    scattered = np.zeros(len(directions))
+    for number in range(int(np.ceil(ranges_m.max(initial=0.0) / _AIR_STEP_M))):
+        on_way = np.flatnonzero(ranges_m > number * _AIR_STEP_M)
+        length_m = np.minimum(ranges_m[on_way] - number * _AIR_STEP_M, _AIR_STEP_M)
+        middle = eye_m + (number * _AIR_STEP_M + length_m / 2)[:, None] * directions[on_way]
+        alpha, _ = air.extinction(middle.T.astype(np.float32))
+        kept = np.exp(-alpha * length_m)
+        lamp = 1.0 / (1.0 + (np.linalg.norm(lamp_m - middle, axis=1) / 12.0) ** 2)
+        scattered[on_way] += left[on_way] * (1.0 - kept) * lamp
+        left[on_way] *= kept
+    return np.asarray(left[:, None] * light + scattered[:, None] * np.array(_AIR_COLOUR) ** 2.2)
 
 
 def _openness(scene: Scene, points: Float64Array, facing: Float64Array, generator: np.random.Generator) -> Float32Array:

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from scenarios import load_scenario
-from scenarios.schema import Prop, Scenario, SurfaceChange, SurfacePlace
+from scenarios.schema import Air, Dust, Prop, Scenario, SurfaceChange, SurfacePlace
 from sim.materials import REFLECTIVITY
 from sim.scene import Scene, build_world
+from sim.sensor.air import AirVolume
+from sim.session.planning import plan_drives
 from sim.view import gallery
 from sim.view.picture import COLOURS, material_colour, part_colours, render
 from sim.view.rock import face_tints
@@ -63,6 +65,34 @@ def test_more_samples_make_the_same_picture_smoother(boxed: Scenario) -> None:
     assert fine.shape == coarse.shape
     assert abs(fine.mean() - coarse.mean()) < 3
     assert np.abs(np.diff(fine, axis=1)).mean() < np.abs(np.diff(coarse, axis=1)).mean()
+
+
+def test_contrast_in_mist_falls_with_range_after_beer_and_lambert(boxed: Scenario) -> None:
+    world = build_world(boxed, 0)
+    scenes = world.after, with_orange_props(world.after)
+
+    def contrast(mist_per_m: float) -> float:
+        air = AirVolume(mist_per_m)
+        plain, red = (render(scene, EYE, TARGET, 120, 90, air=air) / 255.0 for scene in scenes)
+        return float((plain**2.2 - red**2.2)[40:50, 55:65, 2].mean())
+
+    clear, thick = contrast(0.0), contrast(0.25)
+    assert clear == pytest.approx(float(contrast(1e-9)))
+    # the box, 0.6 m deep, stands 3 m before the lens
+    assert np.log(clear / thick) / 0.25 == pytest.approx(2.7, abs=0.15)
+    np.testing.assert_array_equal(
+        render(world.after, EYE, TARGET, 60, 45), render(world.after, EYE, TARGET, 60, 45, air=AirVolume(0.0))
+    )
+
+
+def test_the_gallery_shows_the_dust_of_a_family(boxed: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gallery, "_FAMILY_PX", (160, 100))
+    dusty = boxed.model_copy(
+        update={"after": boxed.after.model_copy(update={"air": Air(dust=Dust(mg_per_m3=1500.0))})}
+    )
+    clear, veiled = (gallery.family_picture(each, 0).astype(float) for each in (boxed, dusty))
+    assert clear.shape == veiled.shape
+    assert veiled.std() < 0.9 * clear.std()
 
 
 def test_every_material_has_a_colour_and_parts_are_drawn_in_theirs(boxed: Scenario) -> None:
@@ -137,7 +167,7 @@ def test_rock_that_came_in_is_red_and_rock_that_fell_out_blue_in_the_picture(
 def test_a_picture_of_a_family_shows_its_movers_and_puddles() -> None:
     walker = "movers=[{name: walker, kind: person, path: {length_m: 6}}]"
     puddle = "puddles=[{name: p, place: {between: [start, bend], fraction: 0.5}, radius_m: 1}]"
-    scene, places = gallery._with_guests(load_scenario("smoke/unchanged", 3, [walker, puddle]), 3)
+    scene, places = gallery._with_guests(plan_drives(load_scenario("smoke/unchanged", 3, [walker, puddle]), 3)[1])
     plain = build_world(load_scenario("smoke/unchanged", 3), 3).after
     added = len(scene.meshes) - len(plain.meshes)
     assert len(places) == 2 and added > 10
