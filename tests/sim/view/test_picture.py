@@ -87,9 +87,7 @@ def test_contrast_in_mist_falls_with_range_after_beer_and_lambert(boxed: Scenari
 
 def test_the_gallery_shows_the_dust_of_a_family(boxed: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gallery, "_FAMILY_PX", (160, 100))
-    dusty = boxed.model_copy(
-        update={"after": boxed.after.model_copy(update={"air": Air(dust=Dust(mg_per_m3=1500.0))})}
-    )
+    dusty = boxed.model_copy(update={"after": boxed.after.model_copy(update={"air": Air(dust=Dust(mg_per_m3=1500.0))})})
     clear, veiled = (gallery.family_picture(each, 0).astype(float) for each in (boxed, dusty))
     assert clear.shape == veiled.shape
     assert veiled.std() < 0.9 * clear.std()
