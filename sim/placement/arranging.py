@@ -208,6 +208,9 @@ def _find_place(job: _Job, stretches: Sequence[Stations], board: _Board) -> list
     rounds = [(stations, wanted, False) for stations in stretches for wanted in (job, opposite)]
     if job.place.posture == "leaning":
         rounds += [(stretches[-1], wanted, True) for wanted in (job, opposite)]
+    if job.prop.kind == "rock" and job.place.posture == "upright":  # it may have no face to stand on that way
+        lying = [replace(each, place=each.place.model_copy(update={"posture": "tipped"})) for each in (job, opposite)]
+        rounds += [(stretches[-1], wanted, False) for wanted in lying]
     why = ""
     for number, (stations, wanted, over_humps) in enumerate(rounds):
         purpose = ("to" if job.is_goal else "place") + (f"-{number}" if number else "")

@@ -189,6 +189,21 @@ def test_a_drawn_prop_that_falls_over_is_set_elsewhere(
         build_world(scenario.model_copy(update={"before": route, "after": route}), 0)
 
 
+def test_a_drawn_rock_without_a_face_to_stand_on_lies_as_it_comes_to_rest(
+    level_tunnel: Tunnel, make_scenario: MakeScenario, make_prop: MakeProp
+) -> None:
+    def rest(place: Place, seed: int) -> Standing:
+        rock = make_prop("rock", kind="rock", size_m=(0.87, 0.77, 0.63), place=place)
+        return build_world(make_scenario(tunnel=level_tunnel, props=(rock,)), seed).standing[0]
+
+    with pytest.raises(ScenarioError, match="prop 'rock' falls over"):
+        rest(Place(between=("a", "b"), fraction=0.5), 38)
+    lying = rest(Place(lateral=0.5), 38)
+    assert tilt_deg(lying) > 20.0
+    assert abs(world_points(lying)[:, 2].min()) < 0.01
+    assert tilt_deg(rest(Place(lateral=0.5), 37)) < 20.0
+
+
 def test_a_prop_settles_the_same_whoever_else_is_there(make_scenario: MakeScenario, make_prop: MakeProp) -> None:
     chair = make_prop("chair", 0.5, -0.7, 25.0, kind="chair", size_m=SIZES["chair"])
     barrel = make_prop("barrel", 0.7, 0.7, kind="barrel", size_m=SIZES["barrel"])
