@@ -1,7 +1,7 @@
 """The program `tunnelcd` from its first moment, before the packages of the command line are imported.
 
-Ctrl-C ends it in one line. A folder or module called `eval`, `scenarios` or `sim` that hides one of ours is named:
-PYTHONPATH and the script's folder come before the installed packages.
+Ctrl-C, SIGTERM and SIGHUP end it in one line. A folder or module called `eval`, `scenarios` or `sim` that hides one of
+ours is named: PYTHONPATH and the script's folder come before the installed packages.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import importlib.util
 import os
 import signal
 import sys
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 
@@ -21,7 +22,7 @@ _PACKAGES = ("eval", "scenarios", "sim")
 def main() -> None:
     """Run the command line and exit; an interrupt before it runs ends with exit code 130, as one while it runs."""
     open_closed_streams()
-    handler = signal.signal(signal.SIGINT, _leave)
+    handlers = {number: signal.signal(number, _leave) for number in _heeded_signals()}
     for name in _PACKAGES:
         if other := find_hiding(name):
             sys.stderr.write(
@@ -30,7 +31,8 @@ def main() -> None:
             )
             raise SystemExit(2)
     run = importlib.import_module("eval.cli.main").main
-    signal.signal(signal.SIGINT, handler)
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
     run()
 
 
@@ -52,8 +54,16 @@ def find_hiding(name: str) -> str:
     return str(found.origin or places[0])
 
 
-def _leave(_number: int, _frame: FrameType | None) -> None:
+def _heeded_signals() -> list[int]:
+    """Return Ctrl-C and those signals that would end this process; `nohup` lets it ignore SIGHUP."""
+    ending = [int(getattr(signal, name)) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    return [int(signal.SIGINT), *(number for number in ending if signal.getsignal(number) == signal.SIG_DFL)]
+
+
+def _leave(number: int, _frame: FrameType | None) -> None:
     """End at once: nothing was begun, and an exception inside an import may be swallowed there."""
-    sys.stderr.write("interrupted; nothing was written\n")
-    sys.stderr.flush()
-    os._exit(130)
+    by = "" if number == signal.SIGINT else f" by {signal.Signals(number).name}"
+    with suppress(OSError):  # the terminal may be gone
+        sys.stderr.write(f"interrupted{by}; nothing was written\n")
+        sys.stderr.flush()
+    os._exit(128 + number)

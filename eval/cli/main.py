@@ -1,6 +1,7 @@
 """The command line: the commands by name, and how it ends.
 
-Exit codes: 0 done, 2 the input is at fault (one line each on standard error), 1 a bug (a traceback), 130 interrupted.
+Exit codes: 0 done, 2 the input is at fault (one line each on standard error), 1 a bug (a traceback), 130 interrupted
+(128 + n by signal n: 143 SIGTERM, 129 SIGHUP).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typer.core import TyperGroup
 from cdpipe.core.threads import fix_threads
 from eval.cli.commands import converting, leaderboard, pair, run, stories, tools, tracing, training, viewing, world
 from eval.core.terminal.exits import input_errors, run_app
-from eval.core.terminal.interrupts import interrupts_kept
+from eval.core.terminal.interrupts import interrupts_kept, tell_interrupt
 from eval.core.terminal.printing import echo
 
 
@@ -26,8 +27,7 @@ class _Funnel(TyperGroup):
         try:
             return super().make_context(*arguments, **options)
         except KeyboardInterrupt as error:
-            sys.stderr.write("interrupted; nothing was written\n")
-            raise typer.Exit(130) from error
+            raise typer.Exit(tell_interrupt("nothing was written")) from error
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
@@ -41,8 +41,7 @@ class _Funnel(TyperGroup):
             again = "the same command without --force" if "--force" in options else "the same command"
             going_on = f"finished {kept} are kept, {again} goes on from there"
             told = going_on if kept else "nothing half-written is left"
-            sys.stderr.write(f"interrupted; {told}\n")
-            raise typer.Exit(130) from error
+            raise typer.Exit(tell_interrupt(told)) from error
 
 
 _KEPT = {

@@ -13,7 +13,7 @@ import typer
 from cdpipe.core.errors import TunnelcdError
 from cdpipe.core.names import visible
 from cdpipe.core.program import open_closed_streams
-from eval.core.terminal.interrupts import interruptible, interrupts_kept
+from eval.core.terminal.interrupts import interruptible, interrupts_kept, tell_interrupt
 
 # A full disk, a read-only one, a file too large for it, a folder or file of another user.
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EACCES, errno.EPERM)
@@ -61,7 +61,7 @@ def run_program(command: Callable[..., None], module: str) -> NoReturn:
 def run_app(app: typer.Typer, name: str, words: Sequence[str], subcommands: Sequence[str] = ()) -> NoReturn:
     """Run a typer application and exit.
 
-    Exit codes: 0 done, 2 mistake of the user (one line each), 1 bug (traceback), 130 interrupted.
+    Exit codes: 0 done, 2 mistake of the user (one line each), 1 bug (traceback), 128 + n signal n (Ctrl-C: 130).
 
     Args:
         app: The application.
@@ -71,7 +71,7 @@ def run_app(app: typer.Typer, name: str, words: Sequence[str], subcommands: Sequ
     """
     open_closed_streams()
     try:
-        with interruptible(), input_errors(), interrupts_kept():
+        with interruptible(), _told_interrupts(), input_errors(), interrupts_kept():
             code = app(args=list(words), prog_name=name, standalone_mode=False)
     except typer.TyperException as error:
         command = " ".join([name, *(word for word in words[:1] if word in subcommands)])
@@ -80,7 +80,13 @@ def run_app(app: typer.Typer, name: str, words: Sequence[str], subcommands: Sequ
         if message:  # there is none for `tunnelcd` alone, which has printed its help
             sys.stderr.write(f"error: {command}: {visible(message)}: `{command} --help` lists its arguments\n")
         raise SystemExit(error.exit_code) from error
-    except (typer.Abort, KeyboardInterrupt) as error:  # of a command's own work, the command says what is kept
-        sys.stderr.write("interrupted; nothing was written\n")
-        raise SystemExit(130) from error
     raise SystemExit(code)
+
+
+@contextmanager
+def _told_interrupts() -> Iterator[None]:
+    """End an interrupt in one line; of a command's own work, the command has said what is kept."""
+    try:
+        yield
+    except (typer.Abort, KeyboardInterrupt) as error:
+        raise SystemExit(tell_interrupt("nothing was written")) from error

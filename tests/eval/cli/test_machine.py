@@ -267,8 +267,10 @@ def test_each_kind_of_names_has_a_title() -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 @pytest.mark.parametrize("moment", ["imports", "command"])
-def test_an_interrupt_is_one_line_from_the_first_moment_on(moment: str) -> None:
+def test_an_interrupt_is_one_line_from_the_first_moment_on(moment: str, name: str) -> None:
+    number = signal.Signals[name]
     # the program says on standard output that it got there, and waits
     program = {
         "imports": (
@@ -293,7 +295,23 @@ def test_an_interrupt_is_one_line_from_the_first_moment_on(moment: str) -> None:
     assert process.stdout is not None
     assert process.stdout.readline() == "there\n"
     time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, err = process.communicate(timeout=20)
     said = {"imports": "nothing was written", "command": "nothing half-written is left"}[moment]
-    assert (process.returncode, err) == (130, f"interrupted; {said}\n")
+    by = "" if name == "SIGINT" else f" by {name}"
+    assert (process.returncode, err) == (128 + number, f"interrupted{by}; {said}\n")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_closed_terminal_leaves_a_command_of_nohup_alone() -> None:
+    program = (
+        "import os, signal, eval.cli.doctor as doctor\n"
+        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        "doctor.examine = lambda: (os.kill(os.getpid(), signal.SIGHUP), print('went on', flush=True), os._exit(0))\n"
+        "from cdpipe.core.program import main\nmain()\n"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", program, "doctor"],
+        capture_output=True, text=True, check=True, cwd=Path(__file__).parents[3],
+    )  # fmt: skip
+    assert (ended.stdout, ended.stderr) == ("went on\n", "")

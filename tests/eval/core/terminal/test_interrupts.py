@@ -84,3 +84,32 @@ def test_a_held_interrupt_comes_at_the_end_and_never_to_processes_started_meanwh
     assert not is_held_in_a_new_process()
     with interrupts_held():
         pass  # nobody pressed anything
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX")
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_the_end_of_a_job_is_an_interrupt_and_its_repetition_leaves_the_cleaning_up_alone(name: str) -> None:
+    number, cleaned = signal.Signals[name], []
+    before = signal.signal(number, signal.SIG_DFL)
+    try:
+        with pytest.raises(KeyboardInterrupt), interruptible():
+            assert callable(signal.getsignal(number))
+            try:
+                signal.raise_signal(number)
+            finally:
+                signal.raise_signal(number)
+                cleaned.append(True)
+        assert cleaned == [True]
+        assert signal.getsignal(number) == signal.SIG_DFL
+        with pytest.raises(KeyboardInterrupt), interruptible(), interrupts_held():
+            signal.raise_signal(number)
+            cleaned.append(True)
+        assert cleaned == [True, True]
+        with pytest.raises(KeyboardInterrupt), interruptible(), interrupts_held():
+            signal.raise_signal(number)
+            raise RuntimeError("a worker got it as well and ended")
+        signal.signal(number, signal.SIG_IGN)
+        with interruptible(), interrupts_held():
+            signal.raise_signal(number)
+    finally:
+        signal.signal(number, before)
