@@ -24,10 +24,11 @@ _MOST_CLAIMS = 100
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a hidden path that becomes `path` when the block succeeds, and is removed when it fails.
+    """Yield the hidden path of an empty file that becomes `path` when the block succeeds, and is removed when it fails.
 
     Raises:
         InputError: The path is a device or a pipe, which would be replaced.
+        BlockingIOError: Another process, or another thread, writes it now.
         OSError: The path is a folder, or nothing can be written there.
     """
     if path.exists() and not path.is_file() and not path.is_dir():
@@ -35,18 +36,24 @@ def whole_file(path: Path) -> Iterator[Path]:
     if path.is_dir() and not path.is_symlink():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     partial = partial_of(path)
+    handle = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.unlink(missing_ok=True)  # it may be a link, which a writer would follow
-        yield partial
-        partial.replace(path)
+        handle = _claim_file(partial)
+        try:
+            yield partial
+            partial.replace(path)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
     except OSError as error:
         if error.filename == str(partial):
             error.filename = str(path)
         name_full_disk(error, path)
         raise
     finally:
-        partial.unlink(missing_ok=True)
+        if handle is not None:
+            os.close(handle)
 
 
 def name_full_disk(error: OSError, path: Path) -> None:
@@ -115,7 +122,11 @@ def hold(folder: Path) -> int | None:
     """
     if sys.platform == "win32":
         return None
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    return _locked(os.open(folder, os.O_RDONLY | os.O_DIRECTORY))
+
+
+def _locked(handle: int) -> int:
+    """Lock an open file or folder and return its handle, which is closed where another process holds it."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -124,6 +135,47 @@ def hold(folder: Path) -> int | None:
     except OSError:
         pass
     return handle
+
+
+def _claim_file(partial: Path) -> int | None:
+    """Make a new file of that name and hold it; what a killed process left there is removed."""
+    if sys.platform == "win32":
+        partial.unlink(missing_ok=True)
+        return None
+    for _ in range(_MOST_CLAIMS):
+        try:
+            handle = _locked(os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666))
+        except FileExistsError:
+            _remove_unheld(partial)
+        except BlockingIOError:
+            continue  # another looks whether it is held
+        else:
+            if _is_held(handle, partial):
+                return handle
+            os.close(handle)
+    raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK), str(partial))
+
+
+def _remove_unheld(partial: Path) -> None:
+    """Remove a file that no process holds; of a link only the link.
+
+    Raises:
+        BlockingIOError: A process holds it.
+    """
+    handle = None
+    try:
+        if stat.S_ISREG(partial.lstat().st_mode):
+            with suppress(PermissionError):
+                handle = _locked(os.open(partial, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK))
+        if handle is None or _is_held(handle, partial):
+            partial.unlink()
+    except FileNotFoundError:
+        pass
+    except BlockingIOError as error:
+        raise BlockingIOError(error.errno, "another `tunnelcd` writes there", str(partial)) from error
+    finally:
+        if handle is not None:
+            os.close(handle)
 
 
 def _claim(partial: Path) -> int | None:
@@ -154,10 +206,10 @@ def _claim(partial: Path) -> int | None:
     raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK), str(partial))
 
 
-def _is_held(handle: int | None, folder: Path) -> bool:
-    """Return whether a handle is still that of the folder of this name; without a handle, whether there is one."""
+def _is_held(handle: int | None, path: Path) -> bool:
+    """Return whether a handle is still that of this name; without a handle, whether there is a folder of this name."""
     try:
-        found = folder.lstat()
+        found = path.lstat()
     except OSError:
         return False
-    return stat.S_ISDIR(found.st_mode) and (handle is None or os.path.samestat(os.fstat(handle), found))
+    return stat.S_ISDIR(found.st_mode) if handle is None else os.path.samestat(os.fstat(handle), found)

@@ -24,6 +24,7 @@ _FAILURES = (errno.EIO, errno.ESTALE)
 _WAYS = {
     **dict.fromkeys(_DISK_ERRORS, "give it a disk with room and leave to write"),
     **dict.fromkeys(_NAME_ERRORS, "name another one"),
+    errno.EAGAIN: "wait until it ends, or name another",
     **dict.fromkeys(_FAILURES, "the disk, or the network to it, failed: start the command again once it works"),
 }
 

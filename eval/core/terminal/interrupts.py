@@ -1,7 +1,7 @@
 """Ctrl-C waits where it would do harm: during imports, and while worker processes start.
 
-SIGTERM, by which a scheduler ends a job, and SIGHUP of a terminal that is closed are treated as Ctrl-C is. A signal that
-this process was told to ignore (`nohup`) stays ignored.
+SIGTERM, by which a scheduler ends a job, and SIGHUP of a terminal that is closed are treated as Ctrl-C is. A signal
+that this process was told to ignore (`nohup`) stays ignored.
 
 Libraries swallow an interrupt that reaches them while they are imported, and then do without what they were importing
 (`try: import x / except BaseException`), or turn it into an `ImportError`. Ctrl-C also reaches every process of a
