@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from cdpipe.core.errors import InputError
@@ -105,16 +105,32 @@ def make_writable(path: Path) -> None:
 
 
 @contextmanager
-def only_writer(folder: Path, command: str) -> Iterator[None]:
+def removed_if_empty(path: Path) -> Iterator[None]:
+    """Remove a new folder where the block fails before it writes anything, unless another process holds it."""
+    was_there = path.exists()
+    try:
+        yield
+    except BaseException:
+        if not was_there and path.is_dir():
+            with suppress(InputError), only_writer(path):
+                if not any(path.iterdir()):
+                    path.rmdir()
+        raise
+
+
+@contextmanager
+def only_writer(folder: Path, command: str = "tunnelcd") -> Iterator[None]:
     """Hold a folder against other processes that ask for it; the system lets it go when this process dies.
 
     Raises:
-        InputError: Another process holds it.
+        InputError: Another process holds it, or it is gone.
     """
     try:
         handle = hold(folder)
     except BlockingIOError as error:
         raise InputError(f"{folder}: another `{command}` writes there: wait until it ends, or name another") from error
+    except OSError as error:
+        raise unwritable(folder, error) from error
     try:
         yield
     finally:

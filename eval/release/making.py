@@ -25,14 +25,13 @@ from pydantic import TypeAdapter
 from cdpipe.core.errors import InputError, ScenarioError
 from cdpipe.core.whole_file import partial_of, whole_file
 from eval.core.cluster import HERE, Where, connected, require_usable
-from eval.core.output import made_parents, make_writable, only_writer, remove, require_no_links
+from eval.core.output import made_parents, make_writable, only_writer, remove, removed_if_empty, require_no_links
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.release.archive import SESSIONS, SUMS, TRUTH, list_files, pack, read_sums, write_sums
 from eval.release.card import write_release_card
 from eval.release.content import Release, ReleasePair
 from eval.release.croissant import FILE
 from eval.running.export import copy_pair
-from eval.running.runfolder import removed_if_empty
 from scenarios.schema import Scenario
 from sim.session.simulate import simulate_pair
 

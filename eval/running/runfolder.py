@@ -40,7 +40,7 @@ from cdpipe.core.files import ArraySpec, read_npz
 from cdpipe.core.geometry.voxel import require_reachable
 from cdpipe.core.names import path_part, visible
 from cdpipe.core.whole_file import whole_file
-from eval.core.output import make_writable, remove, require_no_links
+from eval.core.output import make_writable, only_writer, remove, removed_if_empty, require_no_links
 from eval.core.provenance import FORMAT_VERSION, TOOL
 from eval.core.statistics import summarise
 from eval.core.tablefile import read_table, replace_table, write_rows
@@ -172,15 +172,12 @@ def start_run_folder(path: Path) -> RunFolder:
 
 
 @contextmanager
-def removed_if_empty(path: Path) -> Iterator[None]:
-    """Remove a new folder where the block fails before it writes anything."""
-    was_there = path.exists()
-    try:
-        yield
-    except BaseException:
-        if not was_there and path.is_dir() and not any(path.iterdir()):
-            path.rmdir()
-        raise
+def held_run_folder(path: Path) -> Iterator[RunFolder]:
+    """Open a folder to run in, as `start_run_folder` does, and hold it; a new one that stays empty is removed."""
+    with removed_if_empty(path):
+        run = start_run_folder(path)
+        with only_writer(path):
+            yield run
 
 
 def open_run_folder(path: Path) -> RunFolder:

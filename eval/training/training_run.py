@@ -29,7 +29,7 @@ from cdpipe.training.scan_training import PlaceTask
 from cdpipe.training.sphere_training import SphereTask, read_sphere_data
 from eval.core.charts import BLUE, VERMILLION, Axis, Drawing, Look, Panel, Series
 from eval.core.figures import picture, png
-from eval.core.output import make_writable
+from eval.core.output import make_writable, only_writer
 from eval.core.provenance import git_commit
 from eval.core.terminal.progress import RunProgress
 
@@ -80,56 +80,57 @@ def train_descriptor(
     task = _make_task(name, *tunnels, config.seed)
     task.network.to(place)
     make_writable(out)
-    before = task.scores()
-    latest: list[Progress] = []
+    with only_writer(out, "tunnelcd train"):
+        before = task.scores()
+        latest: list[Progress] = []
 
-    def on_step(step: int, losses: Mapping[str, float]) -> None:
-        told = ", ".join(f"{part} {value:.3f}" for part, value in losses.items())
-        scored = next(iter(latest[-1].scores.items())) if latest else None
-        told += f"; {scored[0]} {scored[1]:.4f}" if scored else ""
-        progress.cells(told, step, config.steps)
+        def on_step(step: int, losses: Mapping[str, float]) -> None:
+            told = ", ".join(f"{part} {value:.3f}" for part, value in losses.items())
+            scored = next(iter(latest[-1].scores.items())) if latest else None
+            told += f"; {scored[0]} {scored[1]:.4f}" if scored else ""
+            progress.cells(told, step, config.steps)
 
-    def on_validation(done: Progress) -> None:
-        latest.append(done)
-        rows = [{"step": each.step, **each.losses, **each.scores, "is_best": each.is_best} for each in latest]
-        with whole_file(out / "curves.csv") as partial:
-            pd.DataFrame(rows).to_csv(partial, index=False, lineterminator="\r\n")
+        def on_validation(done: Progress) -> None:
+            latest.append(done)
+            rows = [{"step": each.step, **each.losses, **each.scores, "is_best": each.is_best} for each in latest]
+            with whole_file(out / "curves.csv") as partial:
+                pd.DataFrame(rows).to_csv(partial, index=False, lineterminator="\r\n")
 
-    # another number of threads or another device adds in another order, and gives other weights
-    computed_by = [f"{threads} threads", *([device] if device != "cpu" else [])]
-    identity = " ".join([name, *digests, *computed_by])
-    history = fit(task, config, out, identity, on_step, on_validation)
-    draw_curves(out / "curves.png", name, history)
-    task.network.to("cpu")
-    finished = task.finish()
-    content = numbered_checkpoint_bytes(task.network)
-    best = next(done for done in reversed(history) if done.is_best)
-    card = {
-        "descriptor": f"{name}: {SOURCES[name]}",
-        "checkpoint": digest(content),
-        **({"network": asdict(task.network.size)} if isinstance(task.network, SphereNetwork) else {}),
-        "data": _described(tunnels[0], digests[0]),
-        "validation": {
-            **_described(tunnels[1], digests[1]),
-            "trained": _rounded(best.scores),
-            "untrained": _rounded(before),
-            **({"calibration": _rounded(finished)} if finished else {}),
-        },
-        "settings": asdict(config),
-        "best_step": best.step,
-        "steps_done": history[-1].step,
-        "losses": _rounded(history[-1].losses),
-        "command": command,
-        "commit": git_commit(),
-        "device": _describe_device(place, threads),
-        "seconds": round(history[-1].seconds, 1),
-    }
-    checkpoint = out / f"{name}.safetensors"
-    with whole_file(checkpoint) as partial:
-        partial.write_bytes(content)
-    with whole_file(out / f"{name}.json") as partial:
-        partial.write_text(json.dumps(card, indent=1) + "\n")
-    return checkpoint, card
+        # another number of threads or another device adds in another order, and gives other weights
+        computed_by = [f"{threads} threads", *([device] if device != "cpu" else [])]
+        identity = " ".join([name, *digests, *computed_by])
+        history = fit(task, config, out, identity, on_step, on_validation)
+        draw_curves(out / "curves.png", name, history)
+        task.network.to("cpu")
+        finished = task.finish()
+        content = numbered_checkpoint_bytes(task.network)
+        best = next(done for done in reversed(history) if done.is_best)
+        card = {
+            "descriptor": f"{name}: {SOURCES[name]}",
+            "checkpoint": digest(content),
+            **({"network": asdict(task.network.size)} if isinstance(task.network, SphereNetwork) else {}),
+            "data": _described(tunnels[0], digests[0]),
+            "validation": {
+                **_described(tunnels[1], digests[1]),
+                "trained": _rounded(best.scores),
+                "untrained": _rounded(before),
+                **({"calibration": _rounded(finished)} if finished else {}),
+            },
+            "settings": asdict(config),
+            "best_step": best.step,
+            "steps_done": history[-1].step,
+            "losses": _rounded(history[-1].losses),
+            "command": command,
+            "commit": git_commit(),
+            "device": _describe_device(place, threads),
+            "seconds": round(history[-1].seconds, 1),
+        }
+        checkpoint = out / f"{name}.safetensors"
+        with whole_file(checkpoint) as partial:
+            partial.write_bytes(content)
+        with whole_file(out / f"{name}.json") as partial:
+            partial.write_text(json.dumps(card, indent=1) + "\n")
+        return checkpoint, card
 
 
 def data_digest(tunnels: Sequence[TunnelShard]) -> str:

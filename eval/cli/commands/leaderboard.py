@@ -84,15 +84,14 @@ def evaluate(
     from eval.plans.cells import list_planned_cases
     from eval.plans.changes import change_plan
     from eval.plans.plan import load_plan
-    from eval.running.runfolder import removed_if_empty, start_run_folder
+    from eval.running.runfolder import held_run_folder
 
     method = Method(name, parse_command(command, gets_merge=merge != "own"), merge, time_limit)
     chosen = change_plan(load_plan(plan), seeds=seeds, split=split)
     committed = find_reference(chosen.name, reference)
     pairs = sorted({(world, seed) for world, seed, _ in list_planned_cases(chosen)})
     warn(why_nothing_compares(chosen.name, pairs, committed, out, name))
-    with removed_if_empty(out), shown_progress(quiet, rate="pairs") as progress:
-        run = start_run_folder(out)
+    with held_run_folder(out) as run, shown_progress(quiet, rate="pairs") as progress:
         argv = ["tunnelcd", *sys.argv[1:]]
         outcome = evaluate_command(chosen, run, method, command=argv, force=force, progress=progress)
     _compare(out, name, committed, quiet=quiet)

@@ -183,12 +183,13 @@ def score(
         if not as_json and not quiet:
             print_pair_row(row, wide=wide)
         return
+    from eval.core.output import only_writer
     from eval.running.predictions import add_predictions
     from eval.running.rescoring import rescore
     from eval.running.runfolder import open_run_folder
 
     run = open_run_folder(folder)
-    with shown_progress(quiet) as progress:
+    with only_writer(run.path), shown_progress(quiet) as progress:
         if predictions is not None and name is not None:
             n_scored, told = add_predictions(run, predictions, name, progress), f"predictions scored as {name}"
         else:
@@ -353,15 +354,14 @@ def _open_mirror(url: str, out: Path) -> Mirror:
 
 def _run(plan: Plan, out: Path, where: Where, *, quiet: bool, wide: bool = False, **options: Any) -> None:
     from eval.plans.cells import expand_cells
-    from eval.running.runfolder import removed_if_empty, start_run_folder
+    from eval.running.runfolder import held_run_folder
     from eval.running.runner import run_plan
     from eval.running.scaling.shards import choose_cells
 
     # raises where settings contradict each other, or there are too many shards, before a folder is made
     choose_cells(expand_cells(plan), options.get("shard"))
     command = ["tunnelcd", *sys.argv[1:]]
-    with removed_if_empty(out), shown_progress(quiet, rate="cells") as progress:
-        run = start_run_folder(out)
+    with held_run_folder(out) as run, shown_progress(quiet, rate="cells") as progress:
         outcome = run_plan(plan, run, command=command, where=where, progress=progress, **options)
     print_results(out, quiet, wide=wide)
     left = f", {outcome.n_left} left by --limit" if outcome.n_left else ""

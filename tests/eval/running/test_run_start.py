@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from cdpipe.methods.registry import Method
 from eval.cli.commands.tools import check_file
 from eval.core import cluster
 from eval.core.cluster import Where, exposure, require_reachable
+from eval.core.output import only_writer, removed_if_empty
 from eval.core.terminal.progress import Lines, Silent
 from eval.plans.plan import Plan, load_plan
 from eval.running import runner
@@ -168,3 +171,33 @@ def test_an_unknown_name_is_checked_with_a_suggestion() -> None:
         check_file("tunelcd")
     with pytest.raises(InputError, match="see `list`"):
         check_file("zzzzz")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
+def test_a_run_folder_that_another_command_writes_is_refused(
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "TOOLS", Tools(simulate=forbidden))
+    plan_of(tmp_path, "{preset: voxel-diff}")
+    run = tmp_path / "run"
+    said = f"error: {run}: another `tunnelcd` writes there: wait until it ends, or name another\n"
+    asked = ("--plan", tmp_path / "plan.yaml", "--command", "true {before} {after} {out}", "--as", "mine", "--out", run)
+    with removed_if_empty(run):
+        run.mkdir()
+        with only_writer(run):
+            for words in (("run", tmp_path / "plan.yaml", "--out", run), ("evaluate", *asked)):
+                code, _, err = command(*words)
+                assert code == 2 and err.endswith(said)  # after a warning of `evaluate`
+                assert run.is_dir() and not any(run.iterdir())
+
+
+def test_a_new_folder_that_another_command_has_taken_meanwhile_stays(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    with ExitStack() as other:
+        with pytest.raises(InputError, match="another"), removed_if_empty(path):
+            path.mkdir()
+            other.enter_context(only_writer(path))
+            raise InputError("another writes there")
+        assert path.is_dir()
+    with pytest.raises(InputError, match=r"cannot write there \(No such file"), only_writer(tmp_path / "gone"):
+        pytest.fail("it is gone")

@@ -15,6 +15,7 @@ import torch
 from cdpipe.descriptors.sphere_network import load_sphere_network
 from cdpipe.descriptors.weights_file import digest
 from cdpipe.io.answer import read_answer
+from eval.core.output import only_writer
 from scenarios.schema import Scenario
 from tests.eval.running.runs import load_small
 
@@ -141,6 +142,18 @@ def test_a_network_for_the_rival_is_trained_by_the_same_command_and_used_at_once
     wrong = ("--set", f"range_net.weights={tmp_path / 'none.safetensors'}", "--out", tmp_path / "wrong", "--quiet")
     code, _, err = command("detect", pair / "before", pair / "after", "--preset", "range-net", *wrong)
     assert code == 2 and "none.safetensors: missing" in err and len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
+def test_a_folder_that_another_training_writes_is_refused(
+    training_data: Path, tmp_path: Path, command: Command
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    with only_writer(out):
+        code, _, err = command("train", training_data, "--out", out, "--steps", 2)
+    said = f"error: {out}: another `tunnelcd train` writes there: wait until it ends, or name another\n"
+    assert (code, err, list(out.iterdir())) == (2, said, [])
 
 
 def test_mistakes_are_one_line(training_data: Path, tmp_path: Path, command: Command) -> None:
