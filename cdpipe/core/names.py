@@ -12,6 +12,9 @@ _DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 _DIGEST_LENGTH = 16
 # Letters and a symbol that are drawn as nothing: fillers of Hangul, and the empty pattern of Braille.
 _BLANKS = dict.fromkeys((0x115F, 0x1160, 0x2800), " ")
+_SCRIPTS_WITHOUT_MARKS = ("LATIN", "GREEK", "CYRILLIC")
+# Marks that are drawn as nothing on any letter: joiners, inherent vowels of Khmer, selectors of variants.
+_NO_MARKS = re.compile("[\u034f\u17b4\u17b5\u180b-\u180f\ufe00-\ufe0f\U000e0100-\U000e01ef]")
 # Besides numbers, what `pandas.read_csv` takes for something else than a text.
 _NO_NAMES = ("na", "n/a", "nan", "none", "null", "true", "false", "1.#ind", "1.#qnan")
 
@@ -40,9 +43,24 @@ def folded(name: str) -> str:
 
 
 def bare(name: str) -> str:
-    """Return a name without what nobody sees: spaces at its ends, format characters, marks; letters in one width."""
-    plain = unicodedata.normalize("NFKC", name).translate(_BLANKS)
-    return "".join(letter for letter in plain if unicodedata.category(letter)[0] not in "CM").strip()
+    """Return what two names share that a reader takes for one: in small letters, without what nobody sees.
+
+    Spaces at the ends, format characters and letters of other widths count as not seen, and so do marks that stand
+    on Latin, Greek and Cyrillic letters or on no letter. In other scripts marks are vowels and tones: they stay.
+    """
+    plain = unicodedata.normalize("NFKC", name).casefold()
+    letters: list[str] = []
+    keeps_marks = False
+    for letter in unicodedata.normalize("NFKC", plain).translate(_BLANKS):
+        kind = unicodedata.category(letter)[0]
+        if kind == "C" or _NO_MARKS.match(letter):
+            continue
+        if kind != "M":
+            keeps_marks = kind == "L" and not unicodedata.name(letter, "").startswith(_SCRIPTS_WITHOUT_MARKS)
+        # the same mark twice is drawn once
+        if kind != "M" or (keeps_marks and letters[-1] != letter):
+            letters.append(letter)
+    return "".join(letters).strip()
 
 
 def require_name(name: str) -> str:

@@ -120,9 +120,12 @@ def _group(files: Sequence[CheckedFile]) -> list[list[CheckedFile]]:
         groups.setdefault((each.content.plan, pairs), []).append(each)
     for group in groups.values():
         names = [bare(each.content.name) for each in group]
-        if twice := [each for each, name in zip(group, names, strict=True) if names.count(name) > 1]:
+        first = next((name for name in names if names.count(name) > 1), None)
+        if twice := [each for each, name in zip(group, names, strict=True) if name == first]:
             told = " and ".join(str(each.path) for each in twice[:2])
-            raise InputError(f"{told}: two results of {twice[0].content.name} on the same pairs: leave one out")
+            shown = " and ".join(dict.fromkeys(visible(each.content.name) for each in twice[:2]))
+            alike = ", which look alike," if " and " in shown else ""
+            raise InputError(f"{told}: two results of {shown}{alike} on the same pairs: leave one out")
     return list(groups.values())
 
 

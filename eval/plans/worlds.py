@@ -25,7 +25,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import (
     AfterValidator,
     BeforeValidator,
@@ -38,7 +37,7 @@ from pydantic import (
 )
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import YamlError, parse_yaml_value
+from cdpipe.core.files import YamlError, dump_yaml, parse_yaml_value
 from cdpipe.core.names import path_part
 from cdpipe.core.yamlfile import Settings, suggest
 from cdpipe.model.config import PipelineConfig
@@ -71,7 +70,7 @@ def raise_as_value_error(check: Callable[[], object]) -> None:
 
 def format_setting(key: str, value: Any) -> str:
     """Return `key=value` as --set takes it."""
-    text = yaml.safe_dump(value, default_flow_style=True, width=10_000)
+    text = dump_yaml(value, default_flow_style=True, width=10_000)
     return f"{key}={text.removesuffix('...' + chr(10)).strip()}"
 
 

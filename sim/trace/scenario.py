@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from cdpipe.core.errors import ScenarioError
+from cdpipe.core.files import dump_yaml
 from cdpipe.core.names import visible
 from cdpipe.core.progress import Progress, report_nothing
 from scenarios.schema import Scenario
@@ -91,7 +91,7 @@ def format_scenario(draft: Draft, found: Trace, folder: Path) -> str:
         "# Nodes lie on the floor, in the coordinates of the mesh (metres, z up). Change what you like, then run",
         "# `tunnelcd check` and `tunnelcd simulate`.",
     ]
-    body = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=110, allow_unicode=True)
+    body = dump_yaml(tree, sort_keys=False, default_flow_style=None, width=110, allow_unicode=True)
     return "\n".join([*head, *(f"# Note: {visible(note)}" for note in found.notes), body])
 
 

@@ -4,7 +4,7 @@ from .json_file import parse_json, read_json
 from .npz_file import read_npz
 from .plain_file import read_bytes, require_plain_file
 from .tensor_file import parse_tensors, read_tensors
-from .yaml_file import Key, YamlError, parse_yaml, parse_yaml_value
+from .yaml_file import Key, YamlError, dump_yaml, parse_yaml, parse_yaml_value
 from .zip_file import opened_zip, read_member
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "Key",
     "YamlError",
     "check_types",
+    "dump_yaml",
     "opened_zip",
     "parse_json",
     "parse_tensors",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +14,8 @@ MAX_VALUES = 40_000
 """The largest shipped file holds 2,100 values, aliases expanded."""
 _MAX_NUMBER_LENGTH = 100  # characters; 0b and 64 digits are 66
 _MAX_INTEGER = 2**64
+# Numbers that YAML 1.1, which asks for a dot and a sign, reads as text: 1e5, 1.5e3, -2E-3.
+_EXPONENT = re.compile(r"[-+]?(?:[0-9]{1,99}\.?[0-9]{0,99}|\.[0-9]{1,99})[eE][-+]?[0-9]{1,5}$")
 _TOO_DEEP = f"nested deeper than {MAX_DEPTH} levels"
 _TOO_MANY = f"more than {MAX_VALUES} values, aliases counted as what they stand for"
 
@@ -94,6 +97,19 @@ class _BoundedLoader(yaml.SafeLoader):
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node
+
+
+class _Dumper(yaml.SafeDumper):
+    """Puts texts that `_BoundedLoader` would read as numbers into quotes."""
+
+
+for _each in (_BoundedLoader, _Dumper):
+    _each.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, [*"-+.0123456789"])
+
+
+def dump_yaml(value: Any, **options: Any) -> str:
+    """Return a text that `parse_yaml` reads as the value; options are those of `yaml.dump`."""
+    return str(yaml.dump(value, Dumper=_Dumper, **options))
 
 
 class _Builder:

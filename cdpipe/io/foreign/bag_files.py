@@ -22,7 +22,7 @@ import numpy as np
 from cdpipe.core.errors import InputError
 from cdpipe.core.isolated_reader import Message
 from cdpipe.core.names import visible
-from cdpipe.io.foreign.bag_layout import find_paths, read_packed, require_one_recording
+from cdpipe.io.foreign.bag_layout import find_paths, list_packed_topics, read_packed, require_one_recording
 from cdpipe.io.foreign.clouds import INTENSITY_FIELDS, TIME_FIELDS, field_of
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -53,7 +53,15 @@ _ERRORS = (
 
 
 def list_topics(path: str) -> Iterator[Message]:
-    """Yield one dict: `topics`, for each its name, type and number of messages."""
+    """Yield one dict: `topics`, for each its name, type and number of messages.
+
+    A file-compressed bag says them in its metadata; it is not decompressed for them.
+    """
+    with _tells(path):
+        named = list_packed_topics(Path(path))
+    if named:
+        yield {"topics": named}, {}
+        return
     with _bag(path) as bag:
         if len(bag.connections) > _MOST_TOPICS:
             raise ValueError(f"{len(bag.connections)} topics")

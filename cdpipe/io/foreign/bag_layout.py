@@ -88,6 +88,16 @@ def read_packed(path: Path) -> tuple[dict[str, Any], list[str]]:
     return {_ABOUT: {**about, **unpacked}}, names
 
 
+def list_packed_topics(path: Path) -> list[list[Any]]:
+    """Return name, type and number of messages of the topics of a file-compressed ROS 2 bag; of another bag none."""
+    if not (path / METADATA).is_file():
+        return []
+    about, names = read_packed(path)
+    listed = about[_ABOUT]["topics_with_message_count"] if names else []
+    told = [(each["topic_metadata"], each["message_count"]) for each in listed]
+    return [[str(topic["name"]), str(topic["type"]), int(count)] for topic, count in told]
+
+
 def _sort_parts(files: Sequence[Path]) -> list[Path]:
     """Return ROS 1 bags in the order of their numbers, which name parts of one recording."""
     found = [match for file in files if (match := _PART.fullmatch(file.stem))]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +9,6 @@ from pathlib import Path
 from cdpipe.core.isolated_reader import IsolatedReader
 from cdpipe.core.plugins import require_extra
 from cdpipe.io.foreign.opening import HowToRead
-from cdpipe.io.foreign.packed_bags import unpack_bag
 from cdpipe.io.foreign.sniff import guess_format
 
 
@@ -37,10 +35,5 @@ def _list_topics(path: Path) -> set[str]:
     """Return the topics of a bag with a message."""
     require_extra("formats", str(path))
     reader = IsolatedReader("cdpipe.io.foreign.bag_files", path, "rosbags")
-    unpacked = unpack_bag(path, reader)
-    try:
-        ((about, _),) = reader.read("list_topics", path=str(unpacked or path))
-    finally:
-        if unpacked is not None:
-            shutil.rmtree(unpacked.parent, ignore_errors=True)
+    ((about, _),) = reader.read("list_topics", path=str(path))
     return {name for name, _, count in about["topics"] if count}

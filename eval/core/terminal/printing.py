@@ -151,6 +151,9 @@ def require_json_file(file: Path | None) -> None:
         raise unwritable(file, error) from error
     if is_folder:
         raise InputError(f"--out {file}: is a folder: name a file")
+    # standard output may be a terminal, a pipe or, behind `>`, a plain file
+    if is_there and (not file.is_file() or file.absolute().parts[1:2] in (("dev",), ("proc",))):
+        raise InputError(f"--out {file}: is no plain file: leave it out, and --json prints on standard output")
     if is_there:
         raise InputError(f"--out {file}: exists: name a new file, or remove this one")
     if not file.absolute().parent.is_dir():

@@ -5,7 +5,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from cdpipe.core.names import LONGEST, folded, path_part, require_name, require_table_name, visible
+from cdpipe.core.names import LONGEST, bare, folded, path_part, require_name, require_table_name, visible
 
 HOSTILE = (
     "", ".", "..", "...", "/", "../..", "../../etc/passwd", ".hidden", "a/b", "a\\b", "C:\\x", "a\0b", "a\nb", "CON",
@@ -47,6 +47,20 @@ def test_names_that_would_share_a_folder_are_equal_when_folded(names: tuple[str,
 def test_what_is_no_name(name: str) -> None:
     with pytest.raises(ValueError, match=r"name|too long"):
         require_name(name)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "is_one"),
+    [
+        ("mine", "Mine", True), ("mine", "mi\u2060ne ", True), ("mine", "\uff4d\uff49\uff4e\uff45", True),
+        ("qed", "q\u0323ed", True), ("1", "1\u0301", True), ("\u03b1\u03b2", "\u03b1\u03b2\u0323", True),
+        ("\u0e01", "\u0e01\ufe0f", True), ("\u0e01\u0e34", "\u0e01\u0e34\u0e34", True), ("m", "m\u0e34", True),
+        ("\u0e01\u0e34", "\u0e01\u0e38", False), ("\u0e01\u0e34", "\u0e01", False),
+        ("\u0915\u093f", "\u0915\u0941", False), ("\u0915\u093e", "\u0915", False), ("mine", "mine2", False),
+    ],
+)  # fmt: skip
+def test_names_that_a_reader_takes_for_one(one: str, other: str, is_one: bool) -> None:
+    assert (bare(one) == bare(other)) is is_one
 
 
 def test_what_a_table_reads_as_something_else_is_no_name_there() -> None:

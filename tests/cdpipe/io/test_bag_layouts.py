@@ -13,9 +13,9 @@ import pytest
 
 pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
 
-from cdpipe.core.errors import InputWarning
+from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.isolated_reader import size_of
-from cdpipe.io.foreign import packed_bags
+from cdpipe.io.foreign import HowToRead, packed_bags, share_topics
 from cdpipe.io.foreign.bag_files import _cloud
 from cdpipe.io.foreign.bag_layout import _make_folder
 from cdpipe.io.readers import open_session
@@ -94,6 +94,18 @@ def test_a_bag_with_compressed_files_is_read(tmp_path: Path, monkeypatch: pytest
         change_metadata(folder, make_jazzy)
     assert worst_m(folder) < 1e-3
     assert not list(tmp_path.glob("tunnelcd-*"))
+
+
+def test_the_topics_of_compressed_bags_are_listed_without_decompressing_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bags = [pack(write_bag(tmp_path / name, MADE, "tf", (f"/{name}/points",))) for name in "ab"]
+    monkeypatch.setattr(packed_bags, "_write_files", lambda *_: pytest.fail("decompressed"))
+    found = share_topics(bags, [HowToRead(topics=("/a/points", "/b/points"))] * 2)
+    assert [how.topics for how in found] == [("/a/points",), ("/b/points",)]
+    change_metadata(bags[0], lambda about: about.pop("topics_with_message_count"))
+    with pytest.raises(InputError, match="a: not a readable bag: 'topics_with_message_count'"):
+        share_topics(bags, [HowToRead(topics=("/a/points",))] * 2)
 
 
 def test_compressed_files_fill_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -186,6 +186,12 @@ def test_a_file_that_is_there_is_not_replaced(
     assert mine.read_text() == "[]" and file.is_symlink() == is_linked
 
 
+@pytest.mark.parametrize("file", ["/dev/stdout", "/dev/null"])
+def test_standard_output_is_written_by_json_and_not_named(command: Command, file: str) -> None:
+    told = f"error: --out {file}: is no plain file: leave it out, and --json prints on standard output\n"
+    assert command("check", "smoke", "--out", file) == (2, "", told)
+
+
 @pytest.mark.parametrize("kind", ["scenarios", "plans", "presets", "sensors", "settings"])
 def test_every_row_is_described(command: Command, kind: str) -> None:
     rows = json.loads(command("list", kind, "--json")[1])

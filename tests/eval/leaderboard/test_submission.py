@@ -562,8 +562,13 @@ def test_no_submission_is_called_as_a_method_of_ours(packed: Path, name: str) ->
 
 def test_no_two_submissions_of_one_table_look_alike(packed: Path, tmp_path: Path) -> None:
     found = read_submission(packed)
+    for name in ("mi\u2060ne ", "Mine", "m\ufe0fine"):
+        with pytest.raises(InputError, match=r"two results of mine and .*, which look alike, on the same pairs"):
+            write_leaderboard([found, renamed(found, name)], tmp_path / "board.html", None)
     with pytest.raises(InputError, match=r"two results of mine on the same pairs"):
-        write_leaderboard([found, renamed(found, "mi\u2060ne ")], tmp_path / "board.html", None)
+        write_leaderboard([found, found], tmp_path / "board.html", None)
+    others = [renamed(found, name) for name in ("\u0e01\u0e34 1", "\u0e01\u0e38 1")]
+    write_leaderboard([found, *others], tmp_path / "board.html", None)
 
 
 def test_a_reference_that_was_given_the_merge_is_told(packed: Path, evaluated: RunFolder, tmp_path: Path) -> None:

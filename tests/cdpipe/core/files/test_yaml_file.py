@@ -1,3 +1,4 @@
+import math
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -6,7 +7,7 @@ import pytest
 import yaml
 
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import YamlError, parse_yaml, parse_yaml_value, yaml_file
+from cdpipe.core.files import YamlError, dump_yaml, parse_yaml, parse_yaml_value, yaml_file
 from cdpipe.core.yamlfile import read_yaml
 
 _LETTERS = "abcdefghi"
@@ -18,6 +19,19 @@ _BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
 @pytest.mark.parametrize("text", ["", "a: 1", "[1, 2.5, off, ~, 0x10, 2020-01-01, '1']", "a: &x {b: 1}\nc: *x\n", "a"])
 def test_what_yaml_reads_is_read(text: str) -> None:
     assert parse_yaml_value(text) == yaml.safe_load(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e5", 1e5), ("1e-3", 1e-3), ("-2E+3", -2e3), ("1.5e3", 1.5e3), (".5e1", 5.0), ("1.e2", 100.0),
+        ("[1e5, '1e5', \"1e5\"]", [1e5, "1e5", "1e5"]), ("!!str 1e5", "1e5"), ("1e", "1e"), ("e5", "e5"),
+        ("1e5m", "1e5m"), ("0x1e5", 0x1E5), ("1_0e5", "1_0e5"), ("a: |\n  1e5", {"a": "1e5"}), ("1e999", math.inf),
+    ],
+)  # fmt: skip
+def test_a_number_with_an_exponent_is_a_number(text: str, value: object) -> None:
+    assert parse_yaml_value(text) == value and type(parse_yaml_value(text)) is type(value)
+    assert parse_yaml_value(dump_yaml(value)) == value
 
 
 def test_aliases_are_copies(tmp_path: Path) -> None:
