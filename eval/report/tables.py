@@ -232,11 +232,12 @@ def methods_table(
 
     Args:
         table: Rows with `domain`, `variant`, `n_pairs`, and for each column its value and perhaps `_low`, `_high`.
-        columns: The columns.
+        columns: The columns; newer ones that the table lacks are left out.
         cases: Rows of results.csv with their `domain`, which tell over how many pairs a mean is.
         caption: What stands above the table.
         counts: Columns that are over items of all pairs together, and the column that counts these items.
     """
+    columns = _held(columns, table)
     rows: list[tuple[str, tuple[Cell, ...]]] = []
     for domain, own in table.groupby("domain", sort=False):
         of_domain = cases if domain == ALL_DOMAINS else cases[cases["domain"] == domain]
@@ -254,9 +255,10 @@ def conditions_table(table: pd.DataFrame, columns: Sequence[Column], caption: st
 
     Args:
         table: As `methods_table` takes it, with the columns of `eval.tables.conditions`.
-        columns: The columns.
+        columns: The columns; newer ones that the table lacks are left out.
         caption: What stands above the table.
     """
+    columns = _held(columns, table)
     rows: list[tuple[str, tuple[Cell, ...]]] = []
     own = table[table["domain"] != ALL_DOMAINS] if told_apart(table) else table[:0]
     for (domain, variant), group in own.groupby(["domain", "variant"], sort=False):
@@ -268,6 +270,10 @@ def conditions_table(table: pd.DataFrame, columns: Sequence[Column], caption: st
             cells = (Cell(condition_of_row(row).words), Cell(str(row["n_pairs"])), *values)
             rows.append((f"{spaced(str(variant))}, {domain_name(str(domain))}", cells))
     return Table(("odometry, sensor", "pairs", *(column.heading for column in columns)), tuple(rows), caption)
+
+
+def _held(columns: Sequence[Column], table: pd.DataFrame) -> list[Column]:
+    return [column for column in columns if column.key in table or not column.is_newer]
 
 
 def group_name(domain: str, rows: Sequence[Mapping[str, Any]]) -> str:

@@ -74,6 +74,7 @@ class Column:
         shown: How a value is written.
         meaning: What it is.
         when_undefined: When it has no value.
+        is_newer: Whether tables of earlier versions lack it; a page of these leaves it out.
     """
 
     key: str
@@ -82,6 +83,7 @@ class Column:
     shown: Callable[[float], str]
     meaning: str = ""
     when_undefined: str = ""
+    is_newer: bool = False
 
 
 def select(columns: Iterable[Column], *keys: str) -> tuple[Column, ...]:

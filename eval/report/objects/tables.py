@@ -45,7 +45,7 @@ OBJECT_COLUMNS = (
     Column("associated_accuracy", "AA", None, share,
            "Associated accuracy of DynamicMap_Benchmark: the root of the share of unchanged points that no object "
            "holds times the share of changed points that one holds; mean over pairs. Padded objects raise it and lower "
-           "IoU, so it is read beside IoU and F1, and none is marked as best."),
+           "IoU, so it is read beside IoU and F1, and none is marked as best.", is_newer=True),
 )  # fmt: skip
 OBJECT_COUNTS = {
     "iou_matched_median": "n_matched", "kind_accuracy": "n_matched", "displacement_error_m": "n_displacements",

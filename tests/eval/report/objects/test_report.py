@@ -2,6 +2,7 @@
 
 import html
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -201,6 +202,15 @@ def test_associated_accuracy_leads_no_table(run: Path) -> None:
     shown = methods_table(rows, OBJECT_COLUMNS, with_domain(read_run(run).results), "", counts=OBJECT_COUNTS)
     cells = [cells[shown.headings.index("AA")] for _, cells in shown.rows]
     assert [(cell.text, cell.is_best) for cell in cells] == [("0.97", False), ("0.99", False)]
+
+
+def test_a_table_from_before_a_column_makes_a_page(run: Path, tmp_path: Path) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    own = pd.read_csv(run / "objects_table.csv")
+    own[[name for name in own if "associated" not in name]].to_csv(tmp_path / "run" / "objects_table.csv", index=False)
+    part = draw_objects(read_run(tmp_path / "run"))
+    assert part is not None and "AA" not in part.tables[0].headings and "F1 at 0.5" in part.tables[0].headings
+    assert all(len(cells) == len(part.tables[0].headings) for _, cells in part.tables[0].rows)
 
 
 def test_the_rivals_iou_stands_beside_in_every_group(run: Path) -> None:
