@@ -20,12 +20,15 @@ from pydantic import Field
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import read_json
 from cdpipe.core.names import path_part
+from cdpipe.core.plugins import extra_version
 from cdpipe.core.yamlfile import Document, Settings, validate
 from cdpipe.io.answer import ANSWER_FILES
 from eval.core.provenance import digest
 from eval.leaderboard.given_merge import MergeMode
 from eval.plans.worlds import world_slug
+from eval.running.pair_run import Pair
 from eval.running.runfolder import RunFolder
+from scenarios.references import without_paths
 
 _EXPECTED = "--force answers all pairs again"
 
@@ -62,12 +65,13 @@ class EvaluationFile(Settings):
 class CallFile(Settings):
     """RUN/evaluations/<method>/<world>/<seed>.json.
 
-    `pair_digest` is "" where the pair cannot be made; `method_digest` (`digest_method`) and `answer_digest`
-    (`digest_answer`) where an older tunnelcd called.
+    `pair_digest` is "" where the pair cannot be made, `world_digest` (`digest_world`) where it can; `method_digest`
+    (`digest_method`) and `answer_digest` (`digest_answer`) where an older tunnelcd called.
     """
 
     method_digest: str = ""
     answer_digest: str = ""
+    world_digest: str = ""
     pair_digest: str
     seconds: Annotated[float, Field(ge=0)]
     error: str
@@ -122,6 +126,12 @@ def digest_pair(pair: Path) -> str:
     """Return the SHA-256 of the truth of a simulated pair: another simulation has another; "" without a pair."""
     truth = pair / "truth" / "changes.json"
     return hashlib.sha256(truth.read_bytes()).hexdigest() if truth.is_file() else ""
+
+
+def digest_world(pair: Pair, commit: str | None) -> str:
+    """Return a digest of a drawn world and of the code that builds it, by which a world that it refused is known."""
+    drawn = None if pair.scenario is None else without_paths(pair.scenario.model_dump(mode="json"), pair.files)
+    return digest({"world": drawn, "seed": pair.seed, "version": extra_version("tunnelcd"), "commit": commit})
 
 
 def digest_answer(answer: Path) -> str:

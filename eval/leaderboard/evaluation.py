@@ -33,6 +33,7 @@ from eval.leaderboard.calls import (
     digest_answer,
     digest_method,
     digest_pair,
+    digest_world,
     evaluation_folder,
     evaluation_path,
     is_exchanged,
@@ -117,7 +118,7 @@ def evaluate_command(
     start_provenance(plan, run, command, tools)
     document = _take_over(run, method, plan, pairs, force=force)
     called = digest_method(document)
-    todo = [pair for pair in pairs if force or not _is_finished(run, method, pair, called)]
+    todo = [pair for pair in pairs if force or not _is_finished(run, method, pair, called, tools.commit())]
     if todo:
         _note_asker(run, document, tools)
     # the order of a plan would tell which world a pair is of; a seed would, too
@@ -231,23 +232,26 @@ def _remove_stale(run: RunFolder, name: str, called: str, pairs: Sequence[Pair])
     return is_changed
 
 
-def _is_finished(run: RunFolder, method: Method, pair: Pair, called: str) -> bool:
+def _is_finished(run: RunFolder, method: Method, pair: Pair, called: str, commit: str | None) -> bool:
     call = read_call(run, method.name, pair.name, pair.seed)
     cell = run.read_cell(run.cell(pair.name, pair.seed, method.name))
     if call is None or cell is None or cell["row"].get("metrics_version") != METRICS_VERSION:
         return False
     if is_exchanged(call, run.answer(pair.name, pair.seed, method.name)):
         return False
-    return call.method_digest == called and _is_about(run, pair, call)
+    return call.method_digest == called and _is_about(run, pair, call, commit)
 
 
-def _is_about(run: RunFolder, pair: Pair, call: CallFile) -> bool:
+def _is_about(run: RunFolder, pair: Pair, call: CallFile, commit: str | None) -> bool:
     """Tell whether a call was about the present world of a pair, as its sessions or the record of removed ones tell.
 
-    A pair that could not be made is one where its seed draws nothing for the same reason; a drawn one is tried again.
+    A pair that could not be made is one where its seed draws nothing for the same reason, or the same world, which
+    this code refused to build.
     """
+    if not call.pair_digest and pair.scenario is None:
+        return call.error == pair.error
     if not call.pair_digest:
-        return pair.scenario is None and call.error == pair.error
+        return call.world_digest == digest_world(pair, commit)
     held = run.pair(pair.name, pair.seed)
     return is_pair_dropped(run, pair) is True or (call.pair_digest == digest_pair(held) and is_simulated(held, pair))
 
@@ -259,10 +263,9 @@ def _evaluate_pair(run: RunFolder, method: Method, pair: Pair, called: str, prog
         remove(stale)
     opened = open_pair(run, pair, progress, tools)
     if isinstance(opened, str):
-        call, score = (
-            CallFile(pair_digest="", seconds=0.0, error=opened, stderr=""),
-            score_unmade(pair, "failed", opened),
-        )
+        refused = digest_world(pair, tools.commit())
+        call = CallFile(pair_digest="", world_digest=refused, seconds=0.0, error=opened, stderr="")
+        score = score_unmade(pair, "failed", opened)
     else:
         progress.stage("command", 0, 1)
         call = _call(run, method, pair, opened, folder)

@@ -26,7 +26,7 @@ from eval.core.terminal.progress import RunProgress, Silent
 from eval.plans.cells import expand_cells
 from eval.plans.plan import Plan
 from eval.plans.variants import Cell
-from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Tools, is_pair_dropped, pair_lock
+from eval.running.pair_run import TOOLS, Made, Pair, PairRun, Tools, is_pair_dropped, is_refused, pair_lock
 from eval.running.run_workers import remove_traces, run_on_workers
 from eval.running.runfolder import RunFolder, current_results, keep_makers, write_json, write_tables
 from eval.running.scaling.keeping import Keep, drop_pair, dropped_file, remove_leftovers
@@ -325,9 +325,9 @@ def _schedule_leanly(schedule: Callable[..., list[Pair]], run: RunFolder, keep: 
 
 
 def _lacks_sessions(run: RunFolder, pair: Pair) -> bool:
-    """Tell whether a finished pair was removed by hand, or left behind by `merge-runs`, so that no record is there."""
+    """Tell whether a finished pair that can be made was removed by hand, or left behind by `merge-runs`: no record."""
     is_there = run.pair(pair.name, pair.seed).is_dir() or dropped_file(run, pair.name, pair.seed).is_file()
-    return not (pair.todo or is_there)
+    return not (pair.todo or is_there or is_refused(run, pair.name, pair.seed))
 
 
 def is_simulated(path: Path, pair: Pair) -> bool:

@@ -424,6 +424,20 @@ def test_a_pair_that_cannot_be_made_any_more_or_can_by_now_is_asked_anew(evaluat
     assert (outcome.n_done, outcome.n_failed) == (1, 0)
 
 
+def test_a_world_that_cannot_be_built_is_tried_again_by_other_code_alone(evaluator: Evaluator) -> None:
+    asked = []
+
+    def simulate(scenario: Scenario, *_: object) -> None:
+        asked.append(scenario)
+        raise ScenarioError("props stand in each other")
+
+    tools = replace(TOOLS, simulate=simulate, commit=lambda: "1" * 40)
+    assert [evaluator.evaluate(tools=tools).n_done for _ in range(2)] == [2, 0]
+    assert len(asked) == 2 and rows_of(evaluator)["error"].tolist() == ["props stand in each other"] * 2
+    assert evaluator.evaluate(tools=tools, force=True).n_done == 2
+    assert evaluator.evaluate(tools=replace(TOOLS, commit=lambda: "2" * 40)).n_failed == 0
+
+
 def test_pairs_whose_sessions_were_removed_are_not_asked_again(evaluator: Evaluator) -> None:
     evaluator.evaluate()
     drop_pair(evaluator.run, ONE_BOX, 20000, "answers")

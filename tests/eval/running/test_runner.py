@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import count, groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -366,6 +366,22 @@ def test_a_world_that_cannot_be_made_is_a_row_and_the_others_go_on(tmp_path: Pat
     assert results["status"].to_dict() == {ONE_BOX: "failed", UNCHANGED: "ok"}
     assert results.loc[ONE_BOX, "error"] == "props stand in each other"
     assert np.isnan(results.loc[ONE_BOX, "region_recall"])
+
+
+@pytest.mark.parametrize("keep", [None, "sessions"])
+def test_a_world_that_cannot_be_built_is_not_tried_again(
+    tmp_path: Path, runner: Runner, keep: Literal["sessions"] | None
+) -> None:
+    asked = []
+
+    def fails(scenario: object, *_: Any) -> None:
+        asked.append(scenario)
+        raise ScenarioError("props stand in each other")
+
+    tools = replace(runner.tools, simulate=fails)
+    for force, n_asked in ((False, 1), (False, 1), (True, 2)):
+        runner.run(tmp_path / "run", plan_of(tmp_path), tools=tools, keep=keep, force=force)
+        assert len(asked) == n_asked
 
 
 def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, runner: Runner) -> None:
