@@ -29,6 +29,12 @@ SURFACE_TABLES = ("surface_changes", "surface_windows")
 _MINIMAL_COLUMNS = {"keyframes": ("keyframe", "score", "label")}
 
 
+def is_row_of_unmade(row: Mapping[str, Any]) -> bool:
+    """Tell whether the row of a cell is of a pair without a truth: its world cannot be made, or its worker died."""
+    n_observable = row.get("n_observable")
+    return row.get("status") != "ok" and (n_observable is None or n_observable != n_observable)  # noqa: PLR0124 - NaN
+
+
 def holds_rows(document: Mapping[str, Any]) -> bool:
     """Return whether a cell holds rows of numbers, and of texts where texts belong, and names its case in each."""
     tables = [[document["row"]], *(document[table] for table in ITEM_TABLES)]

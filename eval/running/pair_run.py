@@ -35,6 +35,7 @@ from eval.oracles.merge import merged_by_truth
 from eval.oracles.regions import regions_by_truth
 from eval.plans.variants import Cell
 from eval.running.cell_file import cell_document
+from eval.running.cell_rows import is_row_of_unmade
 from eval.running.runfolder import RunFolder, write_json
 from eval.running.scaling.keeping import Keep, dropped_file, is_dropped, read_dropped, require_same_bytes
 from eval.running.stages.pair_stages import PairStages
@@ -205,8 +206,7 @@ def is_finished(run: RunFolder, each: Todo) -> bool:
 def is_refused(run: RunFolder, world: str, seed: int) -> bool:
     """Tell whether the rows of a pair say that it cannot be made; `--force` tries it again."""
     cells = map(run.read_cell, sorted(run.cell(world, seed, "").parent.glob("*.json")))
-    # the row of a case without a truth has no figures
-    return any(cell["row"]["status"] != "ok" and "n_observable" not in cell["row"] for cell in cells if cell)
+    return any(is_row_of_unmade(cell["row"]) for cell in cells if cell is not None)
 
 
 def is_pair_dropped(run: RunFolder, pair: Pair) -> bool | None:

@@ -22,9 +22,9 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.names import bare, folded, path_part, require_table_name, visible
 from cdpipe.core.whole_file import whole_file
 from cdpipe.core.yamlfile import suggest
-from cdpipe.io.answer import ANSWER_FILES
+from cdpipe.io.answer import ANSWER_FILES, require_answer_sizes
 from cdpipe.model.config import preset_names
-from eval.core.output import copy_folder, remove
+from eval.core.output import remove
 from eval.core.tablefile import read_table
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.plans.cells import list_planned_cases
@@ -119,8 +119,16 @@ def evaluate(predict: Callable[[Path, Path], object], run: Path | str, name: str
                     f"pair {number + 1} of {len(originals)}: the function wrote no {ANSWER_FILES[0]} to its second "
                     'argument: write one of status "failed" where there is no answer'
                 )
+            try:
+                require_answer_sizes(answer)
+            except InputError as error:
+                told = str(error).replace(f"{answer}/", "")
+                raise InputError(f"pair {number + 1} of {len(originals)}: {told}") from error
             # answers stand beside the pairs that are still to come: their names tell nothing before the last call
-            copy_folder(answer, kept / str(number))
+            (kept / str(number)).mkdir()
+            for file in ANSWER_FILES:
+                if (answer / file).is_file():
+                    shutil.copyfile(answer / file, kept / str(number) / file)
             remove(pair)
             remove(answer)
         for number, original in enumerate(originals):

@@ -12,8 +12,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.names import require_table_name, visible
 from eval.core.terminal.progress import RunProgress, Silent
 from eval.running.cell_file import LAST, NO_KEY, cell_document
-from eval.running.cell_rows import IDENTITY
-from eval.running.results.cases import is_unmade
+from eval.running.cell_rows import IDENTITY, is_row_of_unmade
 from eval.running.runfolder import RunFolder, write_json, write_tables
 from eval.running.scaling.keeping import list_dropped
 from eval.running.scaling.remaking import remade_below
@@ -77,7 +76,7 @@ def _list_unscored(run: RunFolder, documents: dict[Path, dict[str, Any]]) -> lis
         stored = None if path in documents else run.read_cell(path)
         if stored is None or stored["row"].get("metrics_version") == METRICS_VERSION:
             continue
-        if is_unmade(stored["row"]):  # a row of no figures
+        if is_row_of_unmade(stored["row"]):  # a row of no figures
             documents[path] = {**stored, "row": {**stored["row"], "metrics_version": METRICS_VERSION}}
         else:
             left.append(str(path.relative_to(run.path / "cells").with_suffix("")))

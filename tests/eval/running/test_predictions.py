@@ -442,3 +442,28 @@ def test_a_function_that_writes_nothing_is_told_at_its_first_pair(run: RunFolder
     with pytest.raises(InputError, match=r"pair 1 of 2: the function wrote no answer\.json to its second argument"):
         evaluate(lambda pair, _: asked.append(pair), run.path, "mine")
     assert len(asked) == 1
+
+
+@pytest.mark.parametrize("name", ["answer.npz", "answer.json"])
+def test_an_answer_that_nobody_reads_is_not_copied(run: RunFolder, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    def predict(_: Path, answer: Path) -> None:
+        (answer / "answer.json").write_text("{}")
+        with (answer / name).open("r+b" if name == "answer.json" else "wb") as file:
+            file.truncate(1 << 41)  # of nothing: it takes no room on the disk
+
+    monkeypatch.setattr(shutil, "copyfile", lambda *_: pytest.fail("copied"))
+    with pytest.raises(InputError, match=rf"^pair 1 of 2: {name}: .*(GB|MB|bytes)") as caught:
+        evaluate(predict, run.path, "mine")
+    assert "\n" not in str(caught.value)
+
+
+def test_what_a_function_leaves_beside_its_answer_is_not_copied(
+    run: RunFolder, good: tuple[dict[str, Any], dict[str, Any]]
+) -> None:
+    def predict(_: Path, answer: Path) -> None:
+        write_prediction(answer, *good)
+        write_prediction(answer / "more", *good)
+        with (answer / "log.txt").open("wb") as file:
+            file.truncate(1 << 41)
+
+    assert evaluate(predict, run.path, "mine")["status"].tolist() == ["ok", "ok"]

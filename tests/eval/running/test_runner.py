@@ -605,6 +605,7 @@ def test_a_cell_without_truth_gets_the_version_and_one_without_answer_is_told(tm
     run = start_run_folder(tmp_path / "run")
     for name, row in (
         ("unmade", {"status": "failed", "n_observable": None}),
+        ("unmade-too", {"status": "failed"}),  # as a run writes it
         ("lost", {"status": "ok", "n_observable": 1}),
     ):
         named, items = {"scenario": "w", "seed": 1, "variant": name}, {table: [] for table in ITEM_TABLES}
@@ -617,8 +618,8 @@ def test_a_cell_without_truth_gets_the_version_and_one_without_answer_is_told(tm
         write_json(run.path / "cells" / "w" / "1" / f"{name}.json", document)
     documents: dict[Path, dict[str, Any]] = {}
     assert _list_unscored(run, documents) == ["w/1/lost"]
-    ((path, document),) = documents.items()
-    assert (path.stem, document["row"]["metrics_version"]) == ("unmade", METRICS_VERSION)
+    made = {path.stem: document["row"]["metrics_version"] for path, document in documents.items()}
+    assert made == {"unmade": METRICS_VERSION, "unmade-too": METRICS_VERSION}
 
 
 @pytest.mark.parametrize(
