@@ -19,6 +19,7 @@ from cdpipe.core.geometry import (
     transform_each,
 )
 from cdpipe.core.yamlfile import suggest
+from cdpipe.extract.extract import ASKED_POINTS
 from cdpipe.io.answer import Answer
 from cdpipe.model.aligned import merge_at_scans
 from cdpipe.model.report import MAX_DISPLACEMENT_M, ChangedObject, ChangeRegions, ChangeReport, SurfaceField
@@ -30,6 +31,8 @@ from eval.truth.scoring_points import ScoringPoints
 SECONDS = tuple(f"t_{name}_s" for name in ("index", "merge", "refine", "descriptor", "cd", "oe", "returns", "surface"))
 MAX_SECONDS = 1e8  # three years
 MAX_AMOUNT = 1e15  # of bytes, points, scores and every other figure; a page shows no larger one
+# What is stated of a session's map: at most all of its pixels, each with a point and 52 bytes of what a method adds.
+MAX_BYTES_PER_PIXEL = 64
 _UNIT_TOLERANCE = 1e-3  # of the length of a normal: arrays may come as float32
 _MANY = 100  # so many valid returns include the first return of some cell
 # An object lies where its returns are if so large a share of them is so near to its points. Measured: 0.90 and more in
@@ -57,6 +60,9 @@ def check_answer(answer: Answer, truth: GroundTruth, folder: Path, *, is_of_pair
     try:
         _check_seconds(answer.seconds)
         _check_evidence(answer.evidence)
+        points = {name: each.scoring_points for name, each in truth.sessions.items()}
+        n_pixels = {name: each.n_scans * each.n_pixels for name, each in points.items()}
+        _check_stated(answer.evidence, n_pixels)
         if report is None:
             return
         require_poses("before_T_after", report.before_T_after[None])
@@ -69,6 +75,7 @@ def check_answer(answer: Answer, truth: GroundTruth, folder: Path, *, is_of_pair
             require_shape(f"figure_{name}", values, (len(report.regions.scores),))
             if not (np.isnan(values) | ((values >= 0) & (values <= MAX_AMOUNT))).all():
                 raise ValueError(f"figure_{name}: expected numbers from 0 to {MAX_AMOUNT:g}, NaN where there is none")
+        _check_asked(report.figures, n_pixels["before"])
         for index, item in enumerate(report.objects):
             _check_object(index, item, len(report.objects), len(report.regions.scores))
         for session in SESSIONS:
@@ -96,6 +103,27 @@ def _check_evidence(evidence: Mapping[str, float]) -> None:
     for name, value in evidence.items():
         if not (np.isnan(value) or 0 <= value <= MAX_AMOUNT):
             raise ValueError(f"evidence.{name} = {value}: expected 0 to {MAX_AMOUNT:g}, NaN if it was not measured")
+
+
+def _check_stated(evidence: Mapping[str, float], n_pixels: Mapping[SessionName, int]) -> None:
+    """Raise where more points or bytes of a map are stated than its session can give."""
+    most_bytes = MAX_BYTES_PER_PIXEL * n_pixels["before"]
+    most = {f"map_points_{name}": (n, "one") for name, n in n_pixels.items()}
+    most |= dict.fromkeys(("bytes_map_before", "bytes_regions_before"), (most_bytes, f"{MAX_BYTES_PER_PIXEL} bytes"))
+    for name, (limit, told) in most.items():
+        if (value := evidence.get(name, 0.0)) > limit:
+            raise ValueError(f"evidence.{name} = {value:g}: expected at most {limit}, {told} for each pixel")
+
+
+def _check_asked(figures: Mapping[str, Float64Array], n_pixels: int) -> None:
+    """Raise where a region asks for more points of the before map than its session has pixels."""
+    is_beyond = figures.get(ASKED_POINTS, np.zeros(0)) > n_pixels
+    if is_beyond.any():
+        index = int(np.argmax(is_beyond))
+        raise ValueError(
+            f"figure_{ASKED_POINTS}: entry {index} is {figures[ASKED_POINTS][index]:g}: expected at most {n_pixels}, "
+            "one for each pixel of the before session"
+        )
 
 
 def _check_local(local_before_T_after: Float64Array | None, n_keyframes: int, n_scans: int) -> None:

@@ -76,6 +76,25 @@ def test_evidence(value: float, told: str | None) -> None:
         module._check_evidence({"agreement": 1.0, "overlap": value})
 
 
+@pytest.mark.parametrize(
+    ("name", "most"),
+    [("map_points_before", 50), ("map_points_after", 70), ("bytes_map_before", 3200), ("bytes_regions_before", 3200)],
+)
+def test_no_more_is_stated_of_a_map_than_its_session_has(name: str, most: float) -> None:
+    told_of = rf"evidence\.{name} = {most}: expected at most {most}, .* for each pixel"
+    for value, told in ((most, None), (NAN, None), (np.nextafter(most, INF), told_of)):
+        with taken_or_refused(told):
+            module._check_stated({name: value, "overlap": 1e9}, {"before": 50, "after": 70})
+    assert module.MAX_BYTES_PER_PIXEL == 64
+
+
+def test_a_region_asks_for_no_more_points_than_the_session_has() -> None:
+    for asked, told in (([0.0, NAN, 50.0], None), ([0.0, NAN, 51.0], r"figure_asked_points: entry 2 is 51: .* 50, ")):
+        with taken_or_refused(told):
+            module._check_asked({"asked_points": np.array(asked), "others": np.array([1e9])}, 50)
+    module._check_asked({}, 50)
+
+
 def poses(n: int, x_m: float = 0.0) -> np.ndarray:
     return np.stack([make_pose(translation=(0.0, 0.0, x_m))] * n)
 
