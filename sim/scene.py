@@ -38,7 +38,8 @@ from sim.placement.settling import add_mesh, add_solid, quaternion
 from sim.rock.centreline import Centreline, build_centreline
 from sim.rock.foreign import tunnel_mesh
 from sim.rock.grounding import set_on_floor
-from sim.rock.tunnel import mesh_tunnel, require_buildable
+from sim.rock.tunnel import mesh_tunnel
+from sim.size import require_memory, require_size
 
 WALL = "wall"
 WALL_GEOM = 0
@@ -168,7 +169,8 @@ def lay_ground(scenario: Scenario, seed: int) -> Ground:
         )
     tunnel = scenario.tunnel
     centreline = build_centreline(tunnel, seed)
-    require_buildable(tunnel, centreline)
+    require_size(scenario, centreline)
+    require_memory(tunnel, centreline)
     wall = mesh_tunnel(tunnel, centreline, seed) if tunnel.mesh is None else tunnel_mesh(tunnel.mesh)
     if tunnel.mesh is not None:
         centreline = set_on_floor(centreline, Caster([wall]))

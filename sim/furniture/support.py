@@ -68,6 +68,18 @@ def screen_mesh(shells: Sequence[Shell], pins: Sequence[Float64Array], screen: S
     return join_meshes(parts) if parts else EMPTY
 
 
+def count_bolt_faces(bolts: Bolts, area_m2: float) -> float:
+    """Return about how many triangles the bolts of an area of rock have."""
+    return len(_BOLT_FACES) * area_m2 / bolts.spacing_m**2
+
+
+def count_screen_faces(screen: Screen, area_m2: float) -> float:
+    """Return about how many triangles the wire mesh over an area of rock has: four a segment, wires in two ways."""
+    overlapping = 1.0 + _OVERLAP_M / _PANEL_M[0]
+    segment_m = max(_SEGMENT_M, 2 * screen.opening_m)
+    return 8 * screen.share * area_m2 * overlapping**2 / (screen.opening_m * segment_m)
+
+
 def covered_rows(n_rows: int, share: float, generator: np.random.Generator) -> BoolArray:
     """Mark (n_rows,) rows of panels: the wanted share of them, in a few runs with gaps between."""
     n_covered = round(share * n_rows)

@@ -49,6 +49,14 @@ def require_buildable(tunnel: Tunnel, centreline: Centreline) -> None:
         )
 
 
+def count_wall_faces(tunnel: Tunnel, centreline: Centreline) -> float:
+    """Return about how many triangles the walls have, niches left out; 0 for a mesh of somebody else."""
+    if tunnel.mesh is not None:
+        return 0.0
+    sizes = [(len(line.points) * STEP_M, line.section) for line in centreline.drifts]
+    return sum(4 * metres * (each.width_m + each.height_m) for metres, each in sizes) / tunnel.resolution_m**2
+
+
 def mesh_tunnel(tunnel: Tunnel, centreline: Centreline, seed: int) -> Mesh:
     """Return the closed wall mesh, facing into the void.
 

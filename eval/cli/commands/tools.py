@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -295,10 +295,36 @@ def check_file(name_or_path: str) -> str:
         return f"a plan of {len(expand_cells(load_plan(name_or_path)))} cells"
     if kind == "scenario":
         check_scenario(name_or_path)
-        _open_meshes(name_or_path, [load_scenario(name_or_path, seed) for seed in CHECKED_SEEDS])
+        drawn = [load_scenario(name_or_path, seed) for seed in CHECKED_SEEDS]
+        _open_meshes(name_or_path, drawn)
+        _require_sizes(name_or_path, dict(zip(CHECKED_SEEDS, drawn, strict=True)))
     else:
         load_config(name_or_path)
     return f"a {kind}"
+
+
+def _require_sizes(scenario: str, drawn: Mapping[int, Scenario]) -> None:
+    """Refuse a scenario of which one of the checked seeds draws a world that is too large to be built.
+
+    Raises:
+        ScenarioError: It does: one line, of the first such seed.
+    """
+    from cdpipe.core.errors import ScenarioError
+    from scenarios.grafted import GraftScenario
+    from sim.rock.centreline import build_centreline
+    from sim.size import require_size
+
+    for seed, each in drawn.items():
+        if isinstance(each, GraftScenario):
+            continue
+        try:
+            centreline = build_centreline(each.tunnel, seed)
+        except ScenarioError:
+            continue  # a world of this seed alone, which becomes a row of a run
+        try:
+            require_size(each, centreline)
+        except ScenarioError as error:
+            raise ScenarioError(f"{scenario}: seed {seed}: {error}") from error
 
 
 def _open_meshes(scenario: str, drawn: Sequence[Scenario]) -> None:

@@ -186,6 +186,21 @@ def test_a_file_that_is_there_is_not_replaced(
     assert mine.read_text() == "[]" and file.is_symlink() == is_linked
 
 
+def test_a_world_that_is_too_large_is_told_by_check(command: Command, tmp_path: Path) -> None:
+    file = tmp_path / "long.yaml"
+    file.write_text(
+        "score_radius_m: 4.5\ntunnel: {nodes: {a: [0, 0, 0], b: [900, 0, 0]}, drifts: [{nodes: [a, b]}]}\n"
+        "platform: {kind: ground_robot, scan_spacing_m: 0.25}\nbefore: {route: [a, b]}\nafter: {route: [a, b]}\n"
+    )
+    assert command("check", file) == (0, f"{file}: a scenario, no mistakes\n", "")
+    file.write_text(file.read_text().replace("0.25", "1e-3"))
+    code, out, err = command("check", file)
+    assert (code, out) == (2, "") and err.startswith(
+        f"error: {file}: seed 0: before: platform.scan_spacing_m = 0.001: "
+    )
+    assert err.endswith(" at least 0.009\n") and err.count("\n") == 1
+
+
 @pytest.mark.parametrize("file", ["/dev/stdout", "/dev/null"])
 def test_standard_output_is_written_by_json_and_not_named(command: Command, file: str) -> None:
     told = f"error: --out {file}: is no plain file: leave it out, and --json prints on standard output\n"
