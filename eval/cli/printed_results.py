@@ -3,13 +3,13 @@
 # ruff: noqa: PLC0415 - heavy imports stand inside the functions, so that --help and completion are instant
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
-from eval.core.terminal.printing import LINE, MET, echo, echo_wrapped, print_fitted, print_row, print_table
+from eval.core.terminal.printing import LINE, MET, count_pairs, echo, echo_wrapped, print_fitted, print_row, print_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -133,8 +133,24 @@ def _gather_means(folder: Path, *, wide: bool) -> tuple[list[_Table], list[str]]
     if len(merges):
         title = "merge: share of the pairs within the target of their kind, with its 95 % interval"
         tables.append((title, merges, _MERGE_GIVES_WAY))
-    notes = [] if covered.is_whole else [covered.sentence]
+    notes = [*([] if covered.is_whole else [covered.sentence]), *_tell_unmade(results)]
     return tables, [*notes, *(f"note: {line}" for line in list_incomplete_variants(provenance, results))]
+
+
+def _tell_unmade(results: pd.DataFrame) -> Iterator[str]:
+    """Yield how many pairs could not be made, and why the first could not."""
+    from eval.tables.rows import PAIR, texts, with_pair
+
+    # without a single pair there is no such column
+    left = results.drop(with_pair(results).index) if "n_observable" in results else results[results["status"] != "ok"]
+    if not len(left):
+        return
+    n_pairs, n_all = len(left[PAIR].drop_duplicates()), len(results[PAIR].drop_duplicates())
+    first, reason = left.iloc[0], texts(left, "error")[0]
+    yield (
+        f"note: {n_pairs} of {count_pairs(n_all)} could not be made and {'is' if n_pairs == 1 else 'are'} in no mean: "
+        f"{first['scenario']} {first['seed']}: {reason}"
+    )
 
 
 def _tabulate_means(results: pd.DataFrame, *, wide: bool) -> _Table:

@@ -214,6 +214,9 @@ def _notes(
         yield f"No reference rows: {where}."
     elif any(row["n_pairs"] < n_pairs for row in references):
         yield "A reference row with fewer pairs is a mean over those alone."
+    if n_unmade := sum(not pair.files for pair in group[0].content.pairs):
+        verb = "is" if n_unmade == 1 else "are"
+        yield f"{count_pairs(n_unmade)} could not be made, as the file says, and {verb} in no mean."
     yield from note_other_worlds(pd.concat(map(take_rows, group)), [] if data is None else [data])
     digests: dict[tuple[str, int], str] = {}
     for each in group:

@@ -160,7 +160,7 @@ def _caption(words: str, data: RunData, results: pd.DataFrame) -> str:
     n_unmade = sum(is_unmade(row) for row in records(results))
     failed = f"{n_failed - n_unmade} of {len(results)} cases without an answer, which miss all their changes"
     if n_unmade:
-        failed += f", {n_unmade} without a world, which are left out"
+        failed += f", {n_unmade} of pairs that could not be made, which are in no mean"
     beside_work = " Times were measured beside other work." if is_contended(data) else ""
     return (
         f"{told}, {failed if n_failed else 'every case answered'}.{beside_work} In small type: 95 % bootstrap "

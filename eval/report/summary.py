@@ -202,7 +202,8 @@ def _sentence(data: RunData, merges: pd.DataFrame) -> str:
         meaning = "ended without a merge" if ends_at_merge(data) else "gave no answer and count as finding nothing"
         parts.append(f"{len(bad) - n_unmade} of {len(results)} cases {meaning}")
     if n_unmade:
-        parts.append(f"{n_unmade} have no world and are left out")
+        n_lost = len({(row["scenario"], row["seed"]) for row in bad if is_unmade(row)})
+        parts.append(f"{_counted(n_lost, 'pair')} could not be made and {'is' if n_lost == 1 else 'are'} in no mean")
     if n_assumed := int((numbers(results, "is_auroc_assumed")[(results["status"] == "ok").to_numpy()] == 1).sum()):
         parts.append(f"{_counted(n_assumed, 'answer')} without keyframe scores: AUROC 0.5 is assumed")
     own = merges[merges["family"] == ALL_FAMILIES] if len(merges) else merges

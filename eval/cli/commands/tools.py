@@ -295,9 +295,9 @@ def check_file(name_or_path: str) -> str:
         return f"a plan of {len(expand_cells(load_plan(name_or_path)))} cells"
     if kind == "scenario":
         check_scenario(name_or_path)
-        drawn = [load_scenario(name_or_path, seed) for seed in CHECKED_SEEDS]
-        _open_meshes(name_or_path, drawn)
-        _require_sizes(name_or_path, dict(zip(CHECKED_SEEDS, drawn, strict=True)))
+        worlds = {seed: load_scenario(name_or_path, seed) for seed in CHECKED_SEEDS}
+        _open_meshes(name_or_path, [*worlds.values()])
+        _require_sizes(name_or_path, worlds)
     else:
         load_config(name_or_path)
     return f"a {kind}"

@@ -327,6 +327,8 @@ def test_a_pair_that_others_made_can_be_made(evaluated: RunFolder, packed: Path,
     for other in (made, fewer):
         with pytest.raises(InputError, match=rf"changed\.zip: {told}.*mine\.zip has it: leave the file out"):
             write_leaderboard([other, unmade], tmp_path / "board.html", None)
+    write_leaderboard([unmade], tmp_path / "alone.html", None)
+    assert "1 pair could not be made, as the file says, and is in no mean." in (tmp_path / "alone.html").read_text()
     # so have reference rows of a pair, unless it could not be made there either
     rows = [{**pair.row, "variant": "ours"} for pair in made.content.pairs]
     (tmp_path / "report").mkdir()

@@ -8,8 +8,10 @@ import pytest
 
 from cdpipe.core.errors import ScenarioError
 from cdpipe.sensor.ouster import load_profile
+from eval.cli.printed_results import print_summary
 from eval.core.output import remove
 from eval.core.terminal.progress import Silent
+from eval.report.page import write_page
 from eval.running.rescoring import rescore
 from eval.running.runfolder import write_tables
 from eval.running.runner import RunOutcome
@@ -126,7 +128,9 @@ def test_a_family_of_ones_own_is_the_same_world_from_every_folder(
     assert len(runner.asked) == 2
 
 
-def test_a_world_with_settings_that_cannot_be_made_keeps_its_family(tmp_path: Path, runner: Runner) -> None:
+def test_a_world_with_settings_that_cannot_be_made_keeps_its_family_and_is_told(
+    tmp_path: Path, runner: Runner, capsys: pytest.CaptureFixture[str]
+) -> None:
     def fails_with_settings(name: str, seed: int, settings: tuple[str, ...]) -> Scenario:
         if settings:
             raise ScenarioError("props stand in each other")
@@ -138,6 +142,12 @@ def test_a_world_with_settings_that_cannot_be_made_keeps_its_family(tmp_path: Pa
     assert results["status"].tolist() == ["ok", "failed", "failed"]
     assert set(results["family"]) == {ONE_BOX}
     assert table(run, "effects").query("metric == 'region_recall'")["n"].tolist() == [0, 0]
+    print_summary(run.path)
+    out = " ".join(capsys.readouterr().out.split())
+    assert "note: 2 of 3 pairs could not be made and are in no mean: smoke/one_box[" in out
+    assert "20000: props stand in each other" in out
+    page = " ".join(write_page(run.path, "none").read_text().split())
+    assert "3 session pairs, 1 variant, 2 pairs could not be made and are in no mean" in page.replace(";", ",")
 
 
 def test_an_answer_beside_those_of_a_world_gets_the_name_of_the_world(tmp_path: Path, runner: Runner) -> None:
