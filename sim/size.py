@@ -55,12 +55,12 @@ def _require_furniture(tunnel: Tunnel, centreline: Centreline) -> None:
     if (n_faces := sum(faces.values())) <= _MOST_FACES:
         return
     name = max(faces, key=lambda each: faces[each])
-    room = _MOST_FACES - (n_faces - faces[name])
+    room = max(_MOST_FACES - (n_faces - faces[name]), _MOST_FACES / 2)  # the others may be too many as well
     way = "fewer of them"
-    if room > 0 and name in _DISTANCES:
+    if name in _DISTANCES:
         key, power = _DISTANCES[name]
         least_m = getattr(getattr(tunnel.furniture, name), key) * (faces[name] / room) ** power
-        way = f"{key} of at least {1.01 * least_m:.2g}"
+        way = f"{key} of at least {1.01 * least_m:.3g}"
     raise ScenarioError(
         f"tunnel.furniture.{name}: about {faces[name]:.2g} triangles on {_length_m(centreline):.0f} m of drift, and at "
         f"most {_MOST_FACES:.2g} are built: give {way}"
@@ -98,5 +98,5 @@ def _require_revolutions(scenario: Scenario, session: str, centreline: Centrelin
     if way_m > _MOST_REVOLUTIONS * spacing_m:
         raise ScenarioError(
             f"{session}: platform.scan_spacing_m = {spacing_m:g}: {way_m / spacing_m:.2g} revolutions on {way_m:.0f} m "
-            f"of way, and at most {_MOST_REVOLUTIONS} are recorded: at least {way_m / _MOST_REVOLUTIONS:.2g}"
+            f"of way, and at most {_MOST_REVOLUTIONS} are recorded: at least {1.01 * way_m / _MOST_REVOLUTIONS:.3g}"
         )

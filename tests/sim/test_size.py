@@ -29,7 +29,7 @@ after: {route: [a, b]}
 TOO_LARGE = [
     (
         "tunnel.furniture.bolts.spacing_m=0.1",
-        r"tunnel\.furniture\.bolts: about 1\.8e\+08 triangles .* spacing_m of at least 0\.24$",
+        r"tunnel\.furniture\.bolts: about 1\.8e\+08 triangles .* spacing_m of at least 0\.24\d$",
     ),
     (
         "tunnel.furniture.screen.opening_m=0.01",
@@ -38,7 +38,7 @@ TOO_LARGE = [
     ("tunnel.furniture.pipes=[" + "{diameter_m: 0.1, side: left}," * 80 + "]", r"furniture\.pipes: .* fewer of them"),
     (
         "platform.scan_spacing_m=0.01",
-        r"^before: platform\.scan_spacing_m = 0\.01: 1e\+06 revolutions .* at least 0\.1$",
+        r"^before: platform\.scan_spacing_m = 0\.01: 1e\+06 revolutions .* at least 0\.101$",
     ),
     ("props=[{name: p, kind: box, size_m: [1, 1, 1], place: {}, repeat: 1001}]", r"props: 1001 of them: at most 1000"),
 ]

@@ -198,7 +198,7 @@ def test_a_world_that_is_too_large_is_told_by_check(command: Command, tmp_path: 
     assert (code, out) == (2, "") and err.startswith(
         f"error: {file}: seed 0: before: platform.scan_spacing_m = 0.001: "
     )
-    assert err.endswith(" at least 0.009\n") and err.count("\n") == 1
+    assert err.endswith(" at least 0.00909\n") and err.count("\n") == 1
 
 
 @pytest.mark.parametrize("file", ["/dev/stdout", "/dev/null"])
