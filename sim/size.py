@@ -21,7 +21,7 @@ _FACES_PER_M = {"pipes": 51, "ducts": 107, "cable_trays": 102}
 # The setting of what stands apart, and by what power of it fewer triangles make it larger.
 _DISTANCES = {"bolts": ("spacing_m", 0.5), "screen": ("opening_m", 1.0)}
 _BYTES_PER_FACE = 650
-_MOST_PROPS = 1000
+_MOST_PROPS = 3000  # ten minutes to place
 _MOST_REVOLUTIONS = 100_000  # 25 km at the usual spacing; of 128 x 1024 pixels they take 150 GB
 _ARC_SHARE = 0.75  # of a section's width and sides, of which a vault cuts the corners
 

@@ -40,7 +40,7 @@ TOO_LARGE = [
         "platform.scan_spacing_m=0.01",
         r"^before: platform\.scan_spacing_m = 0\.01: 1e\+06 revolutions .* at least 0\.101$",
     ),
-    ("props=[{name: p, kind: box, size_m: [1, 1, 1], place: {}, repeat: 1001}]", r"props: 1001 of them: at most 1000"),
+    ("props=[{name: p, kind: box, size_m: [1, 1, 1], place: {}, repeat: 3001}]", r"props: 3001 of them: at most 3000"),
 ]
 
 
