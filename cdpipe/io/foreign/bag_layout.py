@@ -25,6 +25,9 @@ _KNOWN_VERSION = 8
 # Parts of `rosbag record --split`: run_0.bag or run_2024-05-31-12-30-59_0.bag, the next one without a pause.
 _PART = re.compile(r"(.*?)_?(?:\d{4}(?:-\d\d){5})?_(\d{1,9})")
 _LONGEST_PAUSE_S = 5.0
+# rosbags asks SQLite for `file:PATH?immutable=1`. What follows one of these in the path is no part of its name there:
+# another file is opened, perhaps for writing, and a journal that lies beside it can make SQLite delete any file.
+_NO_NAMES = re.compile("[?#%]")
 
 
 def find_paths(path: Path, folder: Path) -> list[Path]:
@@ -112,17 +115,29 @@ def _sort_parts(files: Sequence[Path]) -> list[Path]:
 
 
 def _renew_metadata(path: Path, folder: Path) -> Path:
-    """Return the folder of a bag, or one with links to its files where its metadata are newer than rosbags knows."""
+    """Return the folder of a bag, or one with links to its files.
+
+    Links are made where the metadata are newer than rosbags knows, or SQLite would take a part of a path for options.
+    """
     about = _read_metadata(path)
     version = about.get("version")
-    if not isinstance(version, int) or version <= _KNOWN_VERSION:
+    is_newer = isinstance(version, int) and version > _KNOWN_VERSION
+    if not is_newer and not _NO_NAMES.search(f"{path.absolute()} {about.get('relative_file_paths')}"):
         return path
-    for name in _list_files(path, about):
-        (folder / name).symlink_to((path / name).absolute())
-    for each in about["topics_with_message_count"]:
-        each["topic_metadata"]["offered_qos_profiles"] = ""
-    _write_metadata(folder, {**about, "version": _KNOWN_VERSION})
+    links = [_link(path / name, folder, number) for number, name in enumerate(_list_files(path, about))]
+    if is_newer:
+        for each in about["topics_with_message_count"]:
+            each["topic_metadata"]["offered_qos_profiles"] = ""
+        about["version"] = _KNOWN_VERSION
+    _write_metadata(folder, {**about, "relative_file_paths": links})
     return folder
+
+
+def _link(file: Path, folder: Path, number: int = 0) -> str:
+    """Link a file of a bag into a folder, and return the link's name: a number, and the suffix if it is plain."""
+    name = f"part_{number}{file.suffix if file.suffix[1:].isalnum() else ''}"
+    (folder / name).symlink_to(file.absolute())
+    return name
 
 
 def _read_metadata(path: Path) -> dict[str, Any]:
@@ -145,12 +160,12 @@ def _list_files(path: Path, about: dict[str, Any]) -> list[str]:
 
 def _make_folder(path: Path, folder: Path, *, is_mcap: bool) -> None:
     """Link a lone file of ROS 2 into a folder, with the metadata that lack."""
-    (folder / path.name).symlink_to(path.absolute())
+    name = _link(path, folder)
     topics = _topics_of_mcap(path) if is_mcap else _topics_of_sqlite(path)
     about = {
         "version": 5,
         "storage_identifier": "mcap" if is_mcap else "sqlite3",
-        "relative_file_paths": [path.name],
+        "relative_file_paths": [name],
         "duration": {"nanoseconds": 0},
         "starting_time": {"nanoseconds_since_epoch": 0},
         "message_count": sum(count for *_, count in topics),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -82,6 +83,39 @@ def test_metadata_that_name_themselves_as_a_file_of_the_bag_are_not_written_over
     before = (folder / "metadata.yaml").read_bytes()
     assert "not a readable bag" in said(folder)
     assert (folder / "metadata.yaml").read_bytes() == before
+
+
+def write_hot_journal(path: Path, names: Path) -> None:
+    """Write a journal of SQLite beside a file, as of a commit to several files that was cut short.
+
+    Whoever opens the file for writing goes back to what was before that commit, and removes the file that it names.
+    """
+    page, mark, name = 4096, bytes.fromhex("d9d505f920a163d7"), str(names).encode()
+    head = mark + struct.pack(">5L", 0, 0, path.stat().st_size // page, 512, page)
+    last = struct.pack(">L", (1 << 30) // page + 1) + name + struct.pack(">LL", len(name), sum(name)) + mark
+    path.with_name(f"{path.name}-journal").write_bytes(head.ljust(512, b"\0") + last)
+
+
+@pytest.mark.parametrize("marks", ["?immutable=0&x=", "#", "%3Fa#"])
+@pytest.mark.parametrize("is_file", [False, True])
+def test_no_name_of_a_file_is_an_option_of_sqlite(tmp_path: Path, marks: str, is_file: bool) -> None:
+    folder = write_bag(tmp_path / "ros2", MADE)
+    (db3,) = folder.glob("*.db3")
+    odd = shutil.copy(db3, folder / f"a{marks}.db3")
+    db3.rename(folder / "a")
+    change_metadata(folder, lambda about: about.update(relative_file_paths=[odd.name]))
+    (victim := tmp_path / "victim").write_text("of the user")
+    write_hot_journal(folder / "a", victim)
+    there = sorted(folder.iterdir())
+    assert worst_m(odd if is_file else folder) < 1e-3
+    assert victim.read_text() == "of the user" and sorted(folder.iterdir()) == there
+
+
+@pytest.mark.parametrize("name", ["run #2", "run?", "100%25"])
+def test_a_bag_in_a_folder_of_any_name_is_read(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).mkdir()
+    assert worst_m(write_bag(tmp_path / "ros2", MADE).rename(tmp_path / name / "bag")) < 1e-3
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 @pytest.mark.parametrize("is_jazzy", [False, True])
