@@ -7,6 +7,8 @@ import re
 import unicodedata
 
 LONGEST = 200  # file systems take names of 255 bytes; suffixes and the marks of unfinished files need the rest
+ADDRESS_MARKS = re.compile("[?#%]")
+"""What a path may hold that is no part of a name in an address, such as the `file:PATH` of SQLite."""
 # Names that Windows keeps for devices, with any suffix.
 _DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 _DIGEST_LENGTH = 16

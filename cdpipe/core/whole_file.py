@@ -185,7 +185,7 @@ def _claim(partial: Path) -> int | None:
         try:
             partial.mkdir()
         except FileExistsError:
-            if partial.is_symlink() or partial.is_file():
+            if partial.is_symlink() or partial.is_file() or _is_of_another(partial):
                 raise
         except FileNotFoundError:
             continue
@@ -204,6 +204,16 @@ def _claim(partial: Path) -> int | None:
             os.close(handle)
     # a network disk may tell other numbers of an open folder than of its name
     raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK), str(partial))
+
+
+def _is_of_another(folder: Path) -> bool:
+    """Return whether a folder is another user's, who could exchange what is written there, or lead it elsewhere."""
+    if sys.platform == "win32":
+        return False
+    try:
+        return folder.lstat().st_uid != os.geteuid()
+    except FileNotFoundError:
+        return False
 
 
 def _is_held(handle: int | None, path: Path) -> bool:

@@ -37,8 +37,8 @@ def count_glb(path: Path) -> GlbCounts:
     """Count what a GLB holds by its table of contents.
 
     Raises:
-        ValueError: The table is damaged, or asks for far more bytes than the file has. A table of another structure
-            may raise AttributeError, LookupError or TypeError.
+        ValueError: The table is damaged, names another file, or asks for far more bytes than the file has. A table of
+            another structure may raise AttributeError, LookupError or TypeError.
     """
     n_bytes = path.stat().st_size
     with path.open("rb") as file:
@@ -49,6 +49,9 @@ def count_glb(path: Path) -> GlbCounts:
         if n_table > n_bytes:
             raise ValueError(f"its table is said to be {n_table} bytes, the file is {n_bytes}")
         table = parse_json(file.read(n_table))
+    for buffer in table.get("buffers", []):
+        if "base64," not in buffer.get("uri", "base64,"):  # which readers look for
+            raise ValueError("a part of it lies in another file: export it as one")
     accessors = table.get("accessors", [])
     n_asked = sum(_natural(view["byteLength"]) for view in table.get("bufferViews", []))
     n_asked += sum(map(_accessor_bytes, accessors))

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from cdpipe.core.errors import InputError
 from cdpipe.core.files.array_spec import ArrayType, Expected, check_types, check_values
 from cdpipe.core.files.plain_file import require_plain_file
-from cdpipe.core.files.zip_file import list_members, read_member
+from cdpipe.core.files.zip_file import list_members, open_archive, read_member
 
 _MAX_HEADER_BYTES = 2048  # of plain arrays: numpy writes 128
 _MAX_AXIS = 2**40
@@ -43,7 +43,7 @@ def read_npz(
     n_bytes = require_plain_file(path, expected=remedy)
     end = f": {remedy}" if remedy else ""
     try:
-        with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+        with path.open("rb") as file, open_archive(file, n_bytes) as archive:
             members = _list_arrays(file, archive, n_bytes)
             contents = {name: read_member(archive, member) for name, member in members.items()}
         types = {name: _parse_header(name, content) for name, content in contents.items()}

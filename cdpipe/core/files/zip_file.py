@@ -24,8 +24,11 @@ from cdpipe.core.errors import InputError
 # Deflate shrinks zeros a thousandfold: what a file may expand to is bounded by its own size.
 _SMALL_BYTES = 128 << 20
 _MAX_RATIO = 8
+# A directory is parsed before its members are looked at: a member takes 46 bytes there at least, and 800 in memory.
+_MOST_DIRECTORY_BYTES = 16 << 20
 _LOCAL_HEADER = struct.Struct("<4s5H3L2H")
 _END = struct.Struct("<4s4H2LH")
+_LOCATOR, _RECORD = struct.Struct("<4sLQL"), struct.Struct("<4sQ2H2L4Q")
 _IN_ZIP64_RECORD = 0xFFFF
 _HAS_DESCRIPTOR = 0x08
 _DESCRIPTOR_BYTES = (12, 16, 20, 24)  # checksum and both sizes, of 32 or 64 bits, with or without a signature
@@ -48,7 +51,7 @@ def opened_zip(
         OSError: The disk does not give or take what it is asked for.
     """
     try:
-        with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+        with path.open("rb") as file, open_archive(file, n_bytes) as archive:
             yield archive, list_members(file, archive, n_bytes)
     except Exception as error:  # zipfile and zlib let through whatever a damaged file provokes
         # a damaged directory may lead to before the start of the file
@@ -57,6 +60,34 @@ def opened_zip(
             raise
         said = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: {said:.300}: {expected}") from error
+
+
+def open_archive(file: IO[bytes], n_bytes: int) -> zipfile.ZipFile:
+    """Return an open file as an archive, after checking that its directory is no larger than can be parsed.
+
+    Raises:
+        ValueError: It is larger, or not at the end of a large file.
+        zipfile.BadZipFile: It is damaged.
+    """
+    if n_bytes > _MOST_DIRECTORY_BYTES and _directory_bytes(file) > _MOST_DIRECTORY_BYTES:
+        raise ValueError(f"its directory takes more than {_MOST_DIRECTORY_BYTES >> 20} MB")
+    return zipfile.ZipFile(file)
+
+
+def _directory_bytes(file: IO[bytes]) -> int:
+    """Return the size of the directory of a large archive as its end tells it."""
+    end = file.seek(-_END.size, io.SEEK_END)
+    signature, *_, n_bytes, _, n_comment = _END.unpack(file.read(_END.size))
+    if signature != b"PK\x05\x06" or n_comment:
+        raise ValueError("its directory is not at its end")
+    file.seek(end - _LOCATOR.size)
+    signature, _, start, _ = _LOCATOR.unpack(file.read(_LOCATOR.size))
+    if signature == b"PK\x06\x07":  # an archive of 64 bits: the record lies there, or right before, as readers differ
+        for place in (start, end - _LOCATOR.size - _RECORD.size):
+            file.seek(place)
+            signature, *_, size, _ = _RECORD.unpack(file.read(_RECORD.size))
+            n_bytes = max(n_bytes, size) if signature == b"PK\x06\x06" else n_bytes
+    return int(n_bytes)
 
 
 def list_members(file: IO[bytes], archive: zipfile.ZipFile, n_bytes: int) -> dict[str, zipfile.ZipInfo]:

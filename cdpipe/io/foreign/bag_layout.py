@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.files import require_plain_file
+from cdpipe.core.names import ADDRESS_MARKS
 
 _MCAP, _SQLITE = b"\x89MCAP", b"SQLite format 3"
 METADATA, _ABOUT = "metadata.yaml", "rosbag2_bagfile_information"
@@ -25,9 +26,6 @@ _KNOWN_VERSION = 8
 # Parts of `rosbag record --split`: run_0.bag or run_2024-05-31-12-30-59_0.bag, the next one without a pause.
 _PART = re.compile(r"(.*?)_?(?:\d{4}(?:-\d\d){5})?_(\d{1,9})")
 _LONGEST_PAUSE_S = 5.0
-# rosbags asks SQLite for `file:PATH?immutable=1`. What follows one of these in the path is no part of its name there:
-# another file is opened, perhaps for writing, and a journal that lies beside it can make SQLite delete any file.
-_NO_NAMES = re.compile("[?#%]")
 
 
 def find_paths(path: Path, folder: Path) -> list[Path]:
@@ -115,14 +113,16 @@ def _sort_parts(files: Sequence[Path]) -> list[Path]:
 
 
 def _renew_metadata(path: Path, folder: Path) -> Path:
-    """Return the folder of a bag, or one with links to its files.
+    """Return the folder of a bag, or one with links to its files where rosbags would not read these.
 
-    Links are made where the metadata are newer than rosbags knows, or SQLite would take a part of a path for options.
+    Its metadata may be newer than rosbags knows. Or a path holds marks of an address: rosbags asks SQLite for
+    `file:PATH?immutable=1`, which is another file then, opened for writing; and a journal that lies beside such a file
+    can name any file for SQLite to delete.
     """
     about = _read_metadata(path)
     version = about.get("version")
     is_newer = isinstance(version, int) and version > _KNOWN_VERSION
-    if not is_newer and not _NO_NAMES.search(f"{path.absolute()} {about.get('relative_file_paths')}"):
+    if not is_newer and not ADDRESS_MARKS.search(f"{path.absolute()} {about.get('relative_file_paths')}"):
         return path
     links = [_link(path / name, folder, number) for number, name in enumerate(_list_files(path, about))]
     if is_newer:

@@ -15,12 +15,14 @@ from __future__ import annotations
 import errno
 import inspect
 import sqlite3
+import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from cdpipe.core.errors import InputError
+from cdpipe.core.names import ADDRESS_MARKS
 from cdpipe.core.plugins import require_extra
 from cdpipe.core.progress import Progress
 from cdpipe.io.out.ros import CLOCK, CLOUD, TRANSFORMS, RosMessages
@@ -76,7 +78,13 @@ def _open_bag(path: Path, messages: RosMessages) -> Iterator[_Write]:
     make: Any = rosbag1.Writer if messages.is_first else rosbag2.Writer
     options = {"version": _VERSION} if "version" in inspect.signature(make).parameters else {}
     try:
-        with make(path, **options) as bag:
+        with ExitStack() as stack:
+            if not messages.is_first and ADDRESS_MARKS.search(str(path.absolute())):
+                # rosbags asks SQLite for `file:PATH`, which would be another file
+                link = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tunnelcd-")), "to")
+                link.symlink_to(path.parent.absolute())
+                path = link / path.name
+            bag = stack.enter_context(make(path, **options))
             topics = {
                 topic: bag.add_connection(topic, kind, typestore=messages.store) for topic, kind in TOPICS.items()
             }

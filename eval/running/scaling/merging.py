@@ -323,7 +323,7 @@ def _take_evaluations(
     for name, document in united.items():
         folder = target / "evaluations" / name
         for run in runs:
-            for path in sorted(run.path.glob(f"evaluations/{name}/*/*.json")):
+            for path in sorted((run.path / "evaluations" / name).glob("*/*.json")):
                 place = folder / path.parent.name / path.name
                 if sources.get(f"cells/{path.parent.name}/{path.stem}/{name}.json", run) is not run:
                     continue

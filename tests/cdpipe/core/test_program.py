@@ -43,6 +43,21 @@ def test_nothing_hides_our_own() -> None:
     assert [find_hiding(name) for name in ("eval", "scenarios", "sim", "nobody_has_this")] == [""] * 4
 
 
+@pytest.mark.parametrize("content", [b"font.size: 60\ntext.usetex: True\n", b"\xff\n", None])
+def test_a_file_in_the_working_folder_sets_no_charts(tmp_path: Path, content: bytes | None) -> None:
+    if content is not None:
+        (tmp_path / "matplotlibrc").write_bytes(content)
+    elif sys.platform == "win32":
+        pytest.skip("has no pipes in folders")
+    else:
+        os.mkfifo(tmp_path / "matplotlibrc")
+    told = "import matplotlib as m, os; print(m.rcParams['text.usetex'], m.rcParams['font.size'], os.getcwd())"
+    words = [sys.executable, "-P", "-c", f"from cdpipe.core.program import *\nimport_charts()\n{told}"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=60)
+    assert (done.stdout, done.stderr) == (f"False 10.0 {tmp_path}\n", "")
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a shell that closes streams")
 @pytest.mark.parametrize(
     ("words", "closed"),

@@ -65,7 +65,9 @@ def refused(result: Result, expected: str) -> None:
     assert expected in err
 
 
-@pytest.mark.parametrize(("name", "options"), [("a.mcap", ()), ("a.bag", ()), ("a", ("--to", "ros2"))])
+@pytest.mark.parametrize(
+    ("name", "options"), [("a.mcap", ()), ("a.bag", ()), ("a", ("--to", "ros2")), ("run #2?", ("--to", "ros2"))]
+)
 def test_a_bag_comes_back_as_it_left(
     name: str, options: tuple[str, ...], pair: Path, tmp_path: Path, command: Command
 ) -> None:

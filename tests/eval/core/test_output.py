@@ -104,6 +104,16 @@ def test_a_link_under_the_hidden_name_is_not_followed(tmp_path: Path) -> None:
     assert tree(tmp_path) == [".out.partial", "mine", "mine/note"]
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="folders have no number of their owner there")
+def test_a_hidden_folder_of_another_user_is_not_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (hidden := tmp_path / ".out.partial").mkdir()
+    (hidden / "own").write_text("x")
+    monkeypatch.setattr(os, "geteuid", lambda: hidden.stat().st_uid + 1)
+    with pytest.raises(InputError, match="out: cannot write there"), new_folder(tmp_path / "out"):
+        pass
+    assert tree(tmp_path) == [".out.partial", ".out.partial/own"]
+
+
 @pytest.mark.parametrize("write", [new_folder, new_files])
 def test_an_output_that_others_made_meanwhile_stays(
     tmp_path: Path, write: Callable[[Path], AbstractContextManager[Path]]

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -179,6 +180,21 @@ def test_a_small_file_that_asks_for_much_time_or_memory_is_refused(tmp_path: Pat
     ):
         (tmp_path / name).write_text(content)
         assert "6,000 parts" in refusal(lambda name=name: prop_mesh(MeshFile(path=str(tmp_path / name)), "x"))
+
+
+@pytest.mark.parametrize("kind", ["a pipe", "a file", "nothing"])
+def test_a_mesh_leads_to_no_other_file(tmp_path: Path, kind: str) -> None:
+    file = glb_of(tmp_path / "a.glb", [{"mesh": 0}])
+    raw = Path(file.path).read_bytes()
+    n_table = int.from_bytes(raw[12:16], "little")
+    table = json.loads(raw[20 : 20 + n_table]) | {"buffers": [{"byteLength": 96, "uri": "other"}]}
+    text = json.dumps(table).encode()
+    Path(file.path).write_bytes(struct.pack("<4sLLL4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text)
+    if kind == "a pipe":
+        os.mkfifo(tmp_path / "other")  # whoever opens it waits for ever
+    elif kind == "a file":
+        (tmp_path / "other").write_bytes(raw[-96:])
+    assert "a part of it lies in another file: export it as one" in refusal(lambda: prop_mesh(file, "x"))
 
 
 def test_no_primitive_is_lost(tmp_path: Path) -> None:
