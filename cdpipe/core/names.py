@@ -87,11 +87,14 @@ def require_table_name(name: str) -> str:
     """Return a name that a user chose for a column of a table.
 
     Raises:
-        ValueError: As `require_name`; or the name would be read back as a number, a truth value or a missing value.
+        ValueError: As `require_name`; or the name would be read back as a number, a truth value or a missing value, or
+            begins as a formula of a spreadsheet does.
     """
     if name.strip("<>#-").casefold() in _NO_NAMES or _is_number(name):
         raise ValueError("expected a name that a table does not read as a number or as missing")
-    return require_name(name)
+    if require_name(name)[0] in "=+-@":
+        raise ValueError(f"expected a name that does not begin with {name[0]}, as a formula of a spreadsheet does")
+    return name
 
 
 def visible(text: str) -> str:

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import io
 import lzma
+import re
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -23,6 +25,8 @@ _MAX_RATIO = 60
 # of a CSV has two bytes at least, one of a packed table next to none.
 _CELL_BYTES, _MIN_CELLS_BYTES, _CELLS_RATIO, _PACKED_CELLS_RATIO = 25, 400_000_000, 10, 100
 _MOST_COLUMNS = 10_000
+# Text that a spreadsheet takes for a formula, which may start a program; figures with a sign hold no letter.
+_FORMULA = re.compile(r"[=@\t]|[+-].*[A-Za-z(|!]", re.DOTALL)
 
 
 def table_file(path: Path) -> Path:
@@ -43,11 +47,33 @@ def table_file(path: Path) -> Path:
     return compressed if compressed.is_file() else folder if folder.is_dir() else path
 
 
+def plain_texts(frame: pd.DataFrame) -> pd.DataFrame:
+    r"""Return a table whose texts and headings are texts to all who read its CSV.
+
+    A `'` stands before what a spreadsheet would take for a formula. A carriage return, which ends a row and is not
+    quoted, is written `\r`.
+    """
+    texts = [name for name, column in frame.items() if not pd.api.types.is_numeric_dtype(column)]
+    changed = {
+        name: frame[name].map(_as_text)
+        for name in texts
+        if any(_as_text(each) is not each for each in frame[name].unique())
+    }
+    return frame.assign(**changed).rename(columns=_as_text)
+
+
+def _as_text(value: Any) -> Any:
+    if not isinstance(value, str):
+        return value
+    text = value.replace("\r", "\\r") if "\r" in value else value
+    return f"'{text}" if _FORMULA.match(text) else text
+
+
 def write_rows(path: Path, frame: pd.DataFrame) -> None:
     """Write a table of rows, NAME.csv, and its Parquet where it is large. Each appears whole or not at all."""
     write_parquet(path, frame[:0])  # none stands beside another CSV
     with whole_file(path) as partial:
-        frame.to_csv(partial, index=False)
+        plain_texts(frame).to_csv(partial, index=False)
     write_parquet(path, frame)
 
 

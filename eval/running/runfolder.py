@@ -43,7 +43,7 @@ from cdpipe.core.whole_file import whole_file
 from eval.core.output import make_writable, only_writer, remove, removed_if_empty, require_no_links
 from eval.core.provenance import FORMAT_VERSION, TOOL
 from eval.core.statistics import summarise
-from eval.core.tablefile import read_table, replace_table, write_rows
+from eval.core.tablefile import plain_texts, read_table, replace_table, write_rows
 from eval.plans.coverage import explain_unreadable_plan, measure_coverage, read_stored_plan
 from eval.plans.targets import read_targets
 from eval.plans.worlds import world_slug
@@ -359,7 +359,7 @@ def json_text(document: Mapping[str, Any]) -> str:
 
 def _write_csv(path: Path, frame: pd.DataFrame) -> None:
     with whole_file(path) as partial:
-        frame.to_csv(partial, index=False)
+        plain_texts(frame).to_csv(partial, index=False)
 
 
 def _plain(value: Any) -> Any:

@@ -69,6 +69,9 @@ def test_what_a_table_reads_as_something_else_is_no_name_there() -> None:
         assert require_name(name) == name and not isinstance(read, str)
         with pytest.raises(ValueError, match="does not read as a number or as missing"):
             require_table_name(name)
+    for name in ("=1+a", "@a", "-a", "+a"):
+        with pytest.raises(ValueError, match="as a formula of a spreadsheet does"):
+            require_table_name(name)
     for name in ("my method 2 (ä)", "3deg", "nano", "v1.5e"):
         assert require_table_name(name) == name
 

@@ -3,10 +3,11 @@
 import lzma
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from cdpipe.core.errors import InputError
-from eval.core.tablefile import read_table
+from eval.core.tablefile import read_table, write_rows
 
 
 @pytest.mark.parametrize("row", ["1,2,3", "1,2," + ",".join("3" * 900)])
@@ -33,3 +34,24 @@ def test_more_columns_than_any_table_of_ours_are_refused(tmp_path: Path) -> None
     path.write_bytes(b"a" + b",a" * 10_000 + b"\n")
     with pytest.raises(InputError, match=r"10001 columns, more than 10000$"):
         read_table(path)
+
+
+FORMULAS = ('=cmd|"/C calc"!A0', "@SUM(1)", "+1-2+cmd|x!A0", '-2 +HYPERLINK("http://x")', "\t=1")
+
+
+def test_no_text_is_a_formula_of_a_spreadsheet(tmp_path: Path) -> None:
+    """The error of an answer, a prop's name or a heading may come from a stranger."""
+    plain = ["a=1", "-0.5", "+3", "", "x -y"]
+    frame = pd.DataFrame({"error": [*FORMULAS, *plain], "=1+1": -1.5, "n": [None, *range(9)]})
+    write_rows(path := tmp_path / "results.csv", frame)
+    read = read_table(path)
+    assert list(read.columns) == ["error", "'=1+1", "n"]
+    assert read["error"].fillna("").tolist() == [*(f"'{text}" for text in FORMULAS), *plain]
+    assert (read["'=1+1"] == -1.5).all()
+    write_rows(path, read)
+    pd.testing.assert_frame_equal(read_table(path), read)
+
+
+def test_a_carriage_return_ends_no_row(tmp_path: Path) -> None:
+    write_rows(path := tmp_path / "results.csv", pd.DataFrame({"error": ["a\rb", "c\nd"], "n": [1, 2]}))
+    assert read_table(path).to_numpy().tolist() == [["a\\rb", 1], ["c\nd", 2]]
