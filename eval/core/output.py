@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -170,16 +171,25 @@ class _EndedError(Exception):
 def require_no_links(folder: Path) -> None:
     """Refuse a folder with a link in it: what is written, replaced or removed below the folder would lie elsewhere.
 
+    A pipe, a socket or a device is refused as well: whoever opens it may wait for ever.
+
     Raises:
-        InputError: It holds a link, at any depth.
+        InputError: It holds one of them, at any depth.
     """
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
-            if (path := Path(parent, name)).is_symlink():
+            path = Path(parent, name)
+            try:
+                mode = path.lstat().st_mode
+            except (FileNotFoundError, NotADirectoryError):  # removed meanwhile by another process
+                continue
+            if stat.S_ISLNK(mode):
                 raise InputError(
                     f"{visible(str(path))}: is a link, and nothing outside of {folder} may be written or removed: "
                     "put the file or folder itself there"
                 )
+            if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+                raise InputError(f"{visible(str(path))}: is a pipe, a socket or a device: remove it")
 
 
 def require_replaceable(path: Path, mark: bytes, what: str) -> None:

@@ -53,13 +53,12 @@ def plain_texts(frame: pd.DataFrame) -> pd.DataFrame:
     A `'` stands before what a spreadsheet would take for a formula. A carriage return, which ends a row and is not
     quoted, is written `\r`.
     """
-    texts = [name for name, column in frame.items() if not pd.api.types.is_numeric_dtype(column)]
-    changed = {
-        name: frame[name].map(_as_text)
-        for name in texts
-        if any(_as_text(each) is not each for each in frame[name].unique())
-    }
-    return frame.assign(**changed).rename(columns=_as_text)
+    plain = frame.copy(deep=False)
+    for name, column in frame.items():
+        is_text = not pd.api.types.is_numeric_dtype(column)
+        if is_text and any(_as_text(each) is not each for each in column.unique()):
+            plain[name] = column.map(_as_text)
+    return plain.rename(columns=_as_text)
 
 
 def _as_text(value: Any) -> Any:

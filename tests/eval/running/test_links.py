@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -41,6 +43,16 @@ def test_a_run_folder_with_a_link_is_refused(
     with pytest.raises(InputError, match=rf"{place}: is a link, and nothing outside of .*: put the"):
         opened(tmp_path / "run")
     assert (outside / "3" / "ours" / "answer.json").read_text() == "precious"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no pipes in folders")
+@pytest.mark.parametrize("opened", [start_run_folder, open_run_folder, write_page])
+def test_a_run_folder_with_a_pipe_is_refused(tmp_path: Path, opened: Callable[[Path], object]) -> None:
+    write_json(tmp_path / "run" / "provenance.json", {"tool": "tunnelcd"})
+    (lock := tmp_path / "run" / "pairs" / "world" / ".3.lock").parent.mkdir(parents=True)
+    os.mkfifo(lock)  # `run` and `evaluate` opened it and waited
+    with pytest.raises(InputError, match=r"\.3\.lock: is a pipe, a socket or a device: remove it"):
+        opened(tmp_path / "run")
 
 
 def test_the_run_folder_itself_may_be_a_link(tmp_path: Path) -> None:
