@@ -144,7 +144,7 @@ def memory_limit(n_bytes: int) -> int:
 def _command() -> list[str]:
     """Return the command that calls `serve` in a process of its own, on our import path without the working folder."""
     here = Path.cwd()
-    folders = [folder for folder in sys.path if folder and Path(folder).absolute() != here]
+    folders = [folder for folder in sys.path if Path(folder).is_absolute() and Path(folder) != here]
     return [sys.executable, "-I", "-c", _START, json.dumps([folders, str(_PACKAGE_FILE), __name__])]
 
 

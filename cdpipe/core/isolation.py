@@ -42,7 +42,8 @@ def run_isolated(call: Callable[[Any], Any], document: Any) -> Any:
         RuntimeError: The function raised anything else, whose traceback is on standard error.
     """
     argv = [sys.executable, "-P", "-m", __name__, call.__module__, call.__qualname__]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    # an editable installation has a mark on its path that would be the name of a folder here
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if os.path.isabs(path))}
     with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
         if process.stdin is None or process.stdout is None:
             raise RuntimeError("no pipes")

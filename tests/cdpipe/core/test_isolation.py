@@ -121,6 +121,16 @@ def test_what_lies_in_the_working_folder_is_not_run(tmp_path: Path) -> None:
     assert not (hostile / "run").exists()
 
 
+def test_the_mark_of_an_editable_installation_is_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mark = "__editable__.tunnelcd-0.3.0.finder.__path_hook__"  # as setuptools puts on the path
+    (tmp_path / mark).mkdir()
+    (tmp_path / mark / "json.py").write_text("from pathlib import Path\nPath('run').touch()\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [mark, *sys.path])
+    assert run_isolated(echo, "all") == "all"
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_process_ends_with_the_one_that_started_it(tmp_path: Path) -> None:
     told = tmp_path / "pid"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(ROOT), str(HERE)))}
