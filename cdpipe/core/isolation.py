@@ -15,6 +15,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from cdpipe.core.errors import InputError, ScenarioError, TunnelcdError
@@ -43,7 +44,7 @@ def run_isolated(call: Callable[[Any], Any], document: Any) -> Any:
     """
     argv = [sys.executable, "-P", "-m", __name__, call.__module__, call.__qualname__]
     # an editable installation has a mark on its path that would be the name of a folder here
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if os.path.isabs(path))}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if Path(path).is_absolute())}
     with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
         if process.stdin is None or process.stdout is None:
             raise RuntimeError("no pipes")
