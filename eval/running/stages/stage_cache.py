@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 import cdpipe
 from cdpipe.core.errors import InputError
-from cdpipe.core.files import ArrayType, read_npz
+from cdpipe.core.files import ArrayType, read_npz, require_plain_file
 from cdpipe.core.whole_file import whole_file
 from eval.core.provenance import digest, digest_file
 
@@ -29,6 +29,7 @@ MAPS = "maps"
 # Maps are large: at most this much of them is stored in a run folder.
 MAPS_BYTES = 4 << 30
 _FORMAT = 1  # rises when stage_results.py makes something else of the same result
+_MOST_BYTES = 2 << 30  # of a file of a session; of a chunk, 120 MB are written
 _SECONDS, _IS_CONTENDED, _N_ARRAYS = "seconds.", "is_contended", "n_arrays"
 # Deflating noise takes as long as computing it, and saves nothing.
 _NOISE = ".return_offsets"
@@ -95,9 +96,15 @@ def open_cache(folder: Path, sessions: tuple[Path, Path]) -> StageCache:
 
 
 def session_digest(session: Path) -> str:
-    """Return the digest of the files of a session that the pipeline may read: all but its truth."""
-    files = (path for path in session.rglob("*") if path.is_file())
-    return files_digest(session, [path for path in files if path.relative_to(session).parts[0] != "truth"])
+    """Return the digest of the files of a session that the pipeline may read: all but its truth.
+
+    Raises:
+        InputError: One is far larger than any of ours; a file without content may be of any size.
+    """
+    files = [path for path in session.rglob("*") if path.is_file() and path.relative_to(session).parts[0] != "truth"]
+    for path in files:
+        require_plain_file(path, _MOST_BYTES, "expected a file of a session: remove the pair")
+    return files_digest(session, files)
 
 
 def files_digest(folder: Path, paths: Iterable[Path]) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from torch import nn
 
-from cdpipe.core.errors import MergeFailedError
+from cdpipe.core.errors import InputError, MergeFailedError
 from cdpipe.descriptors.change_network import make_untrained_change_network
 from cdpipe.descriptors.network import make_untrained_network
 from cdpipe.descriptors.sphere_network import make_untrained_sphere_network
@@ -30,7 +30,7 @@ from eval.running.runfolder import RunFolder, start_run_folder
 from eval.running.runner import run_plan
 from eval.running.stages import pair_stages, stage_cache, stage_results
 from eval.running.stages.pair_stages import PairStages
-from eval.running.stages.stage_cache import Kept, StageCache, open_cache
+from eval.running.stages.stage_cache import Kept, StageCache, open_cache, session_digest
 from eval.running.stages.stage_results import is_kept, name_result, pack, unpack
 from eval.truth.adapters import pipeline_input
 from scenarios.library import load_scenario
@@ -472,3 +472,11 @@ def test_regions_of_plugins_are_not_kept() -> None:
     of_others = config.model_copy(update={"regions": RegionsConfig.model_construct(source="higher")})
     assert not is_kept("regions", of_others)
     assert is_kept("merge", of_others)
+
+
+def test_a_huge_file_without_content_is_not_read(tmp_path: Path) -> None:
+    (chunk := tmp_path / "chunks" / "00000.npz").parent.mkdir()
+    with chunk.open("wb") as file:
+        file.truncate(1 << 40)  # an hour
+    with pytest.raises(InputError, match=r"00000\.npz: 1099512 MB, more than the 2147 MB it may have"):
+        session_digest(tmp_path)
