@@ -261,7 +261,7 @@ def note_other_worlds(results: pd.DataFrame, references: Sequence[RunData]) -> I
             )
         if rows and (worlds := find_other_worlds(results, pd.DataFrame(rows))):
             where = f"{count_pairs(len(worlds))} of {data.folder.path.name}"
-            yield f"{where} hold other changes or another drive ({worlds[0]})"
+            yield f"{where} hold other changes, another drive or another score radius ({worlds[0]})"
 
 
 def show_span(key: str, low: float, high: float) -> str:

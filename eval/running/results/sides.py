@@ -19,6 +19,11 @@ from eval.scoring.scoring import METRICS_VERSION
 from eval.tables.rows import PAIR
 
 _MAX_NAMED = 6
+# figures that depend on the pair alone, not on the answer: changes, path, what a region must reach, rock that moved
+_OF_THE_WORLD = (
+    "n_changes", "n_observable", "after_path_m", "score_radius_m", "overlap_true", "n_surface_places",
+    "n_surface_changes",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,7 +187,7 @@ def cautions(a: Side, b: Side) -> list[str]:
     if (worlds := other_worlds(a, b)) and not is_one_run(a, b):
         named = ", ".join(worlds[:_MAX_NAMED]) + (" and others" if len(worlds) > _MAX_NAMED else "")
         told = "1 shared pair holds" if len(worlds) == 1 else f"{len(worlds)} shared pairs hold"
-        found.append(f"{told} other changes or another drive on the two sides ({named}).")
+        found.append(f"{told} other changes, another drive or another score radius on the two sides ({named}).")
     if why := why_no_times(a, b):
         found.append(f"Times are not judged: {why}.")
     for side in {each.path: each for each in (a, b)}.values():
@@ -196,15 +201,15 @@ def cautions(a: Side, b: Side) -> list[str]:
 
 
 def other_worlds(a: Side, b: Side) -> list[str]:
-    """Return the shared pairs with another number of changes or length of path: the seed drew another world."""
+    """Return the shared pairs that ask for other things (`_OF_THE_WORLD`): the seed drew another world."""
     return find_other_worlds(a.results, b.results)
 
 
 def find_other_worlds(a: pd.DataFrame, b: pd.DataFrame) -> list[str]:
-    """Return the pairs that rows of results.csv share, with another number of changes or length of path."""
+    """Return the pairs that rows of results.csv share, and that ask for other things (`_OF_THE_WORLD`)."""
     found = []
     worlds = [results.groupby(PAIR) for results in (a, b)]
-    for key in ("n_changes", "n_observable", "after_path_m"):
+    for key in _OF_THE_WORLD:
         if key not in a or key not in b:
             continue
         first, second = (pd.to_numeric(group[key].first(), errors="coerce").astype(float) for group in worlds)

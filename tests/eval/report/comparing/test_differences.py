@@ -357,13 +357,26 @@ def test_what_is_on_one_side_only_is_counted_and_named(write: Write) -> None:
     assert only_in(b, a) == []
 
 
+@pytest.mark.parametrize(
+    ("column", "values"),
+    [("score_radius_m", (4.5, 9.0)), ("n_surface_places", (2400, 2300)), ("overlap_true", (1.0, 0.9))],
+)
+def test_pairs_that_ask_for_something_else_are_told(write: Write, column: str, values: tuple[float, float]) -> None:
+    sides = [
+        read_side(str(write(name, [row(1, **{column: values[0]}), row(2, **{column: value})])))
+        for name, value in zip("ab", values, strict=True)
+    ]
+    assert cautions(sides[0], sides[1])[0].endswith("on the two sides (regions/narrow 2).")
+    assert not any("shared pair" in told for told in cautions(sides[0], sides[0]))
+
+
 def test_cautions_about_worlds_and_machines(write: Write) -> None:
     a = write("a", [row(1, n_changes=2), row(2, n_changes=2)])
     b = write("b", [row(1, n_changes=2), row(2, n_changes=3)])
     sides = [read_side(str(each)) for each in (a, b)]
     assert is_one_machine(*sides)
     assert cautions(*sides) == [
-        "1 shared pair holds other changes or another drive on the two sides (regions/narrow 2)."
+        "1 shared pair holds other changes, another drive or another score radius on the two sides (regions/narrow 2)."
     ]
     (b / "provenance.json").write_text(json.dumps({"tool": "tunnelcd", "machine": {"cpu": "another"}}))
     sides[1] = read_side(str(b))
