@@ -17,6 +17,7 @@ from cdpipe.core.errors import InputError, InputWarning, MergeFailedError
 from cdpipe.core.geometry import Float64Array, Int64Array
 from cdpipe.core.plugins import require_extra
 from cdpipe.core.threads import THREADS
+from cdpipe.core.yamlfile import setting_lines
 from cdpipe.descriptors.describe import list_checkpoints, load_descriptors, require_weights_are_read, use_threads
 from cdpipe.extract.extract import extract_changes, make_report
 from cdpipe.io.known_merge import require_rigid
@@ -27,7 +28,7 @@ from cdpipe.mapping.session_check import unit_hint
 from cdpipe.merge.coverage import measure_coverage
 from cdpipe.merge.merge import merge_maps, take_known_merge
 from cdpipe.methods.registry import list_extras, load_source
-from cdpipe.model.config import PipelineConfig, Site, load_config
+from cdpipe.model.config import PipelineConfig, Site, load_config, require_settings_are_read
 from cdpipe.model.report import ChangeRegions, ChangeReport, SurfaceField
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, ScanSource
 from cdpipe.pipeline.hooks import Done, Hooks
@@ -72,8 +73,10 @@ def detect(
         ValueError: `before_T_after` is no rigid transform.
     """
     known = None if before_T_after is None else require_rigid(before_T_after)
+    settings = setting_lines(settings)
     config = load_config(preset, settings, site)
     require_usable(config, is_merge_known=known is not None)
+    require_settings_are_read(config, settings)
     use_threads(THREADS)
     hooks = hooks or Hooks()
     (before, stored_before), (after, stored_after) = (_open(each, config) for each in (before, after))

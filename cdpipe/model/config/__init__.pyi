@@ -7,6 +7,7 @@ from .comparison import (
     QueryConfig,
     RegionsConfig,
 )
+from .idle import explain_idle_setting, list_idle_settings, require_settings_are_read
 from .mapping import DescriptorConfig, MapConfig, MergeConfig, SphereConfig
 from .pipeline import OF_WHOLE_MAPS, PipelineConfig, setting_fields, settings_table
 from .presets import WEIGHTS, WEIGHTS_FILES, Site, load_config, preset_files, preset_names
@@ -35,9 +36,12 @@ __all__ = [
     "Site",
     "SphereConfig",
     "SurfaceConfig",
+    "explain_idle_setting",
+    "list_idle_settings",
     "load_config",
     "preset_files",
     "preset_names",
+    "require_settings_are_read",
     "setting_fields",
     "settings_table",
 ]

@@ -3,7 +3,16 @@ from pathlib import Path
 import pytest
 
 from cdpipe.core.errors import InputError
-from cdpipe.model.config import PipelineConfig, load_config, preset_names, settings_table
+from cdpipe.core.yamlfile import setting_lines
+from cdpipe.model.config import (
+    PipelineConfig,
+    RegionsConfig,
+    list_idle_settings,
+    load_config,
+    preset_names,
+    settings_table,
+)
+from cdpipe.pipeline import detect
 
 WITHOUT_SITE = ("tunnelcd", "every-keyframe", "sphere-difference", "kiss-matcher", "frame")
 
@@ -215,3 +224,28 @@ def test_an_empty_preset_with_settings_is_refused_in_one_line(tmp_path: Path) ->
         for settings in ([], ["seed=1"], ["query.radius_m=6"]):
             with pytest.raises(InputError, match=r"^[^\n]*p\.yaml: expected keys and values, got [^\n]*$"):
                 load_config(str(tmp_path / "p.yaml"), settings)
+
+
+@pytest.mark.parametrize("setting", ["voxel_diff.voxel_m=0.3", "m3c2.cylinder_m=1", "range_net.threshold=0.9"])
+def test_a_setting_of_another_source_of_regions_is_not_read(setting: str) -> None:
+    section = setting.partition(".")[0]
+    with pytest.raises(
+        InputError, match=rf"^{setting}: regions\.source = sphere does not read the section {section}: "
+    ):
+        detect("before", "after", settings=[setting])
+    own = load_config(section.replace("_", "-"), [setting])
+    assert list_idle_settings(own, [setting]) == []
+
+
+def test_sections_that_two_methods_read_and_those_that_an_answer_states() -> None:
+    setting = "m3c2.cylinder_m=1"
+    for more in ("regions.source=m3c2-ep", "surface.method=m3c2", "surface.method=m3c2-ep"):
+        settings = [more, setting, "extract.method=surface"]
+        assert list_idle_settings(load_config("tunnelcd", settings), settings) == []
+    settings = ["surface.method=c2c", "c2c.distance_m=0.5"]
+    assert list_idle_settings(load_config("tunnelcd", settings), settings) == ["c2c.distance_m=0.5"]
+    stated = setting_lines(load_config("tunnelcd").model_dump())
+    assert any(line.startswith("m3c2.") for line in stated)
+    assert list_idle_settings(load_config("tunnelcd", stated), stated) == []
+    plugin = load_config("tunnelcd").model_copy(update={"regions": RegionsConfig.model_construct(source="own")})
+    assert list_idle_settings(plugin, [setting]) == []

@@ -144,7 +144,10 @@ def test_pairs_of_one_name_that_are_other_worlds_are_told(tmp_path: Path) -> Non
     for reference, n_other in ((frame, 0), (other, 1)):
         data = take_other_methods(read(tmp_path / str(n_other), reference), "mine")
         found = compare_with_reference(own(frame), "mine", [data], {})
-        assert sum("other changes, another drive or another score radius (narrow 2)" in note for note in found.notes) == n_other
+        assert (
+            sum("other changes, another drive or another score radius (narrow 2)" in note for note in found.notes)
+            == n_other
+        )
 
 
 def test_pairs_of_another_commit_are_told(tmp_path: Path) -> None:

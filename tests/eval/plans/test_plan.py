@@ -570,3 +570,16 @@ def test_surface_is_a_section_of_the_method_and_a_list_of_the_world() -> None:
 def test_a_plan_file_that_is_not_there_says_what_was_expected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"gone\.yaml: no such file: expected a plan, or a name of `tunnelcd list"):
         load_plan(str(tmp_path / "gone.yaml"))
+
+
+def test_a_setting_that_no_method_of_the_plan_reads_is_refused(tmp_path: Path) -> None:
+    start = "{name: m, scenarios: [narrow], seeds: [7], "
+    rule = r"^voxel_diff\.voxel_m=0\.3: regions\.source = sphere does not read the section voxel_diff: leave it out, "
+    with pytest.raises(InputError, match=rule):
+        expand_cells(read(tmp_path, start + "set: [voxel_diff.voxel_m=0.3], variants: [{preset: tunnelcd}]}"))
+    with pytest.raises(InputError, match=r"^c2c\.distance_m=0\.3: .*\nc2c\.distance_m=0\.4: "):
+        grid = "grid: [{variant: tunnelcd, keys: {c2c.distance_m: [0.3, 0.4]}}]}"
+        expand_cells(read(tmp_path, start + "variants: [{preset: tunnelcd}, {preset: c2c}], " + grid))
+    # one set is for all variants: it is enough that one of them reads it
+    shared = "set: [voxel_diff.voxel_m=0.3], variants: [{preset: tunnelcd}, {preset: voxel-diff}]}"
+    assert len(expand_cells(read(tmp_path, start + shared))) == 2

@@ -1,0 +1,65 @@
+"""Settings that a method does not read: sections of whole-map sources beside another source."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
+
+from cdpipe.core.errors import InputError
+from cdpipe.model.config.comparison import SOURCES_AT_KEYFRAMES, WHOLE_MAP_SOURCES
+from cdpipe.model.config.pipeline import PipelineConfig
+
+# sources that read the section of another one
+_BORROWED: Mapping[str, tuple[str, ...]] = MappingProxyType({"m3c2": ("m3c2-ep",)})
+# sources with the name of a rival of the displacement that reads the same section
+_OF_SURFACES = ("m3c2", "m3c2-ep")
+
+
+def list_idle_settings(config: PipelineConfig, settings: Iterable[str]) -> list[str]:
+    """Return those of some settings that a method does not read; a plugin's source may read any.
+
+    One that is the default is none of them: the settings that an answer states hold sections that it did not read.
+
+    Args:
+        config: The settings of the method.
+        settings: Settings `key=value`, or keys, that somebody gave.
+    """
+    if config.regions.source not in (*SOURCES_AT_KEYFRAMES, *WHOLE_MAP_SOURCES):
+        return []
+    readers = {source.replace("-", "_"): (source, *_BORROWED.get(source, ())) for source in WHOLE_MAP_SOURCES}
+    found = []
+    for setting in settings:
+        section, _, key = setting.partition("=")[0].partition(".")
+        of_section = readers.get(section, ())
+        of_surface = [name for name in of_section if name in _OF_SURFACES]
+        is_read = config.regions.source in of_section or config.surface.method in of_surface
+        if of_section and not is_read and not _is_default(config, section, key):
+            found.append(setting)
+    return found
+
+
+def _is_default(config: PipelineConfig, section: str, key: str) -> bool:
+    values = (getattr(each, section) for each in (config, PipelineConfig()))
+    one, other = (getattr(each, key) if key else each for each in values)
+    return bool(one == other)
+
+
+def explain_idle_setting(setting: str, sources: Sequence[str]) -> str:
+    """Return one line on a setting that no method reads whose sources of regions are `sources`."""
+    section = setting.partition("=")[0].partition(".")[0]
+    source = section.replace("_", "-")
+    ways = f"regions.source={source}" + (f" or surface.method={source}" if source in _OF_SURFACES else "")
+    return (
+        f"{setting}: regions.source = {' and '.join(dict.fromkeys(sources))} does not read the section {section}: "
+        f"leave it out, or set {ways}"
+    )
+
+
+def require_settings_are_read(config: PipelineConfig, settings: Iterable[str]) -> None:
+    """Refuse settings that the method does not read: they would change nothing.
+
+    Raises:
+        InputError: One of them is of the section of another source of regions.
+    """
+    if idle := list_idle_settings(config, settings):
+        raise InputError("\n".join(explain_idle_setting(each, [config.regions.source]) for each in idle))
