@@ -31,7 +31,7 @@ from cdpipe.io.ply import write_ply_points
 from cdpipe.io.session import is_session
 from cdpipe.io.tum import write_tum
 from cdpipe.mapping.poses.odometry import ODOMETRIES, estimate_cloud_motion
-from cdpipe.mapping.poses.pose_check import check_quaternion_order
+from cdpipe.mapping.poses.pose_check import check_poses
 from cdpipe.model.types import PosedScan
 
 KISS_ICP = "kiss-icp"
@@ -131,7 +131,7 @@ def open_recording(path: Path, how: HowToRead, report: Progress) -> PosedClouds:
         return source
     if not source.clouds.is_stream:
         if how.odometry is None and len(source.odom_T_sensor) > 1:
-            check_quaternion_order(source, source.poses_from)
+            check_poses(source, source.poses_from)
         return source
     with _removed_on_error(Path(tempfile.mkdtemp(prefix="tunnelcd-read-"))) as folder:
         opened = _write_stream(source, folder / "scans", how, report)
@@ -153,7 +153,7 @@ def convert_recording(path: Path, out: Path, how: HowToRead, report: Progress) -
         _write_stream(source, out, how, report)
     else:
         if how.odometry is None:
-            check_quaternion_order(source, source.poses_from)
+            check_poses(source, source.poses_from)
         write_scans(source, out, report)
     return len(source.odom_T_sensor), source.poses_from
 
@@ -164,7 +164,7 @@ def _write_stream(source: _Posed, folder: Path, how: HowToRead, report: Progress
     clouds = open_folder(folder, "ply", has_poses=True)
     opened = PosedClouds(clouds, source.odom_T_sensor, source.stamps_s, None)
     if how.trajectory is not None:
-        check_quaternion_order(opened, source.poses_from)
+        check_poses(opened, source.poses_from)
     return opened
 
 

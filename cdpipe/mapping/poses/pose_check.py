@@ -1,4 +1,4 @@
-"""Check of a trajectory against the scans: the order of its quaternions."""
+"""Check of a trajectory against the scans: the order of its quaternions, and the frame that the scans are in."""
 
 from __future__ import annotations
 
@@ -20,34 +20,43 @@ _N_QUERIES, _N_POINTS = 1500, 15_000
 _TIMES_BETTER, _FITS_M = 2.5, 0.3
 
 
-def check_quaternion_order(source: ScanSource, where: str) -> None:
-    """Refuse poses whose quaternions are in the order w, x, y, z where x, y, z, w is expected.
+def check_poses(source: ScanSource, where: str) -> None:
+    """Refuse quaternions in the order w, x, y, z where x, y, z, w is expected, and scans that are registered already.
 
     Turns between poses are the same in both orders, so only the scans tell: pairs that the trajectory turns against
-    each other are laid over one another with the poses as they are, and as they would be in the other order.
+    each other are laid over one another with the poses as they are, as they would be in the other order, and not moved
+    at all.
 
     Args:
         source: The scans, with the poses as they were read.
         where: The trajectory, for the message.
 
     Raises:
-        InputError: The scans fit much better in the other order.
+        InputError: The scans fit much better in the other order, or where they are.
     """
     poses = source.odom_T_sensor
-    swapped = swap_quaternions(poses)
+    swapped, unmoved = swap_quaternions(poses), np.broadcast_to(np.eye(4), poses.shape)
     pairs = list(islice(_turned_pairs(poses), _N_PAIRS))
     if len(pairs) < _LEAST_PAIRS:
         return
     found = []
     for one, other in pairs:
         fixed, moving = source.scan(one).points_sensor, source.scan(other).points_sensor
-        found.append([_misfit_m(fixed, moving, invert(each[one]) @ each[other]) for each in (poses, swapped)])
-    given_m, swapped_m = np.median(np.array(found), axis=0)
-    if swapped_m < _FITS_M and given_m > _TIMES_BETTER * swapped_m:
+        ways = (poses, swapped, unmoved)
+        found.append([_misfit_m(fixed, moving, invert(each[one]) @ each[other]) for each in ways])
+    given_m, swapped_m, unmoved_m = np.median(np.array(found), axis=0)
+    best_m = min(swapped_m, unmoved_m)
+    if best_m >= _FITS_M or given_m <= _TIMES_BETTER * best_m:
+        return
+    if unmoved_m <= swapped_m:
         raise InputError(
-            f"{where}: the scans lie {given_m:.2f} m apart with its quaternions as qx qy qz qw, {swapped_m:.2f} m as "
-            "qw qx qy qz: they look like qw first: move that column to the end"
+            f"{where}: the scans lie {given_m:.2f} m apart with these poses, {unmoved_m:.2f} m as they are: they look "
+            "registered already, in the frame of the poses: give them in the frame of the sensor"
         )
+    raise InputError(
+        f"{where}: the scans lie {given_m:.2f} m apart with its quaternions as qx qy qz qw, {swapped_m:.2f} m as "
+        "qw qx qy qz: they look like qw first: move that column to the end"
+    )
 
 
 def swap_quaternions(poses: Float64Array) -> Float64Array:

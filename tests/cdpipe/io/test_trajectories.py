@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ pytest.importorskip("pypcd4", reason="pip install 'tunnelcd[formats]'")
 pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
 
 from cdpipe.core.errors import InputError, InputWarning
+from cdpipe.core.geometry import transform
 from cdpipe.io.foreign import HowToRead, convert_recording, read_poses
 from cdpipe.io.readers import open_session
 from cdpipe.io.tum import read_tum
@@ -70,6 +72,18 @@ def test_quaternions_with_w_first_are_noticed(tmp_path: Path) -> None:
     assert "they look like qw first" in said(folder)
     write_trajectory(folder / "t.tum", dense.stamps_s)
     assert worst_m(folder) < 1e-4
+
+
+@pytest.mark.parametrize("kind", ["tum", "kitti"])
+def test_scans_that_are_registered_already_are_noticed(tmp_path: Path, kind: str) -> None:
+    dense = drive(n_points=40_000, sweep_s=0.0)
+    poses = odom_T_sensor(dense.stamps_s)
+    clouds = [(transform(pose, points), offset_s) for pose, (points, offset_s) in zip(poses, dense.clouds, strict=True)]
+    folder = write_pcds(tmp_path / "run", replace(dense, clouds=clouds), with_time=False)
+    write_trajectory(folder / "t.tum" if kind == "tum" else folder / "poses.txt", dense.stamps_s, kind)
+    told = said(folder)
+    assert "they look registered already, in the frame of the poses: give them in the frame of the sensor" in told
+    assert "qw first" not in told
 
 
 def test_quaternions_with_w_first_are_noticed_where_a_bag_is_converted(tmp_path: Path) -> None:

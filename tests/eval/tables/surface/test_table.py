@@ -88,6 +88,24 @@ def test_windows_of_checks_set_no_threshold_but_count_as_false_alarms() -> None:
     assert (row["threshold_m"], row["n_null_windows"]) == pytest.approx((0.019, 21))
 
 
+def test_guesses_where_no_threshold_comes_from_pay_and_the_share_of_false_alarms_tells() -> None:
+    def judge(guessed_share: float) -> dict:
+        n_guessed = round(50 * guessed_share)
+        nulls = [{**window(0.0, 0.001 * (k % 8), seed=k), "is_check": False} for k in range(100)]
+        checks = [
+            {**window(0.0, 0.5 if k < n_guessed else 0.001 * (k % 8), seed=k), "is_check": True} for k in range(50)
+        ]
+        # 4 of 10 are found; of the others those at which it guesses with the right sign
+        n_found = 4 + round(6 * guessed_share)
+        moved = [{**window(0.02, 0.02 if k < n_found else 0.0, seed=k), "is_check": False} for k in range(10)]
+        return detection_limits(pd.DataFrame([*nulls, *checks, *moved]))[0]
+
+    honest, guessing, loud = judge(0.0), judge(0.28), judge(0.5)
+    assert np.isnan(honest["limit_m"]) and honest["false_share"] == 0.0
+    assert guessing["limit_m"] == 0.02 and guessing["false_share"] == pytest.approx(14 / 150)
+    assert np.isnan(loud["limit_m"]) and loud["threshold_m"] == pytest.approx(0.5)
+
+
 @pytest.mark.parametrize(
     ("shares", "limit_m"),
     [
