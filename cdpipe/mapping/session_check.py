@@ -28,6 +28,8 @@ _FLAT, _ROUND = 0.12, 0.25
 _MIN_RETURNS = 100
 _MAX_TILT_DEG = 45.0
 _STANDING_M = 1.0
+# Clocks beyond this count from 1970; sensors without such a clock count from when they were switched on. Seconds.
+_CALENDAR_S = 1e9
 # Largest ratio of the median ranges of two sessions of one tunnel.
 _SAME_TUNNEL = 1.4
 # Tolerance factor of a ratio of lengths against a ratio of units.
@@ -66,6 +68,21 @@ def is_same_session(before: ScanSource, after: ScanSource) -> bool:
     return np.array_equal(before.odom_T_sensor, after.odom_T_sensor) and np.array_equal(
         before.scan(0).points_sensor, after.scan(0).points_sensor
     )
+
+
+def are_swapped(before: ScanSource, after: ScanSource) -> bool:
+    """Return whether the later session was recorded first; False where a clock is not that of the calendar."""
+    start_s, after_start_s = map(_start_s, (before, after))
+    return min(start_s, after_start_s) > _CALENDAR_S and after_start_s < start_s
+
+
+def _start_s(source: ScanSource) -> float:
+    """Return when a session began, by its own clock, seconds; 0 where it does not tell."""
+    stamps_s = getattr(source, "stamps_s", None)
+    if stamps_s is not None and len(stamps_s):
+        return float(stamps_s[0])
+    session = getattr(source, "session", None)
+    return 1e-9 * getattr(session, "provenance", {}).get("sensor_clock_start_ns", 0)
 
 
 def unit_hint(before: PointMap, after: PointMap) -> str:

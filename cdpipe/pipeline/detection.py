@@ -24,7 +24,7 @@ from cdpipe.io.known_merge import require_rigid
 from cdpipe.mapping.free_space import views_of_one
 from cdpipe.mapping.poses.recorded_frames import regions_as_mapped, report_as_recorded
 from cdpipe.mapping.scanless import adapt_to_whole_maps
-from cdpipe.mapping.session_check import unit_hint
+from cdpipe.mapping.session_check import are_swapped, unit_hint
 from cdpipe.merge.coverage import measure_coverage
 from cdpipe.merge.merge import merge_maps, take_known_merge
 from cdpipe.methods.registry import list_extras, load_source
@@ -80,6 +80,11 @@ def detect(
     use_threads(THREADS)
     hooks = hooks or Hooks()
     (before, stored_before), (after, stored_after) = (_open(each, config) for each in (before, after))
+    if are_swapped(before, after):
+        told = (
+            f"{after.name} was recorded before {before.name}, by the clocks of both: is the earlier session the first?"
+        )
+        warnings.warn(f"{told} What was added is told as removed otherwise", InputWarning, stacklevel=2)
     sources, stored = (before, after), (stored_before, stored_after)
     config = adapt_to_whole_maps(sources, config, is_merge_known=known is not None)
     mapped = map_pair(sources, config, hooks, stored)

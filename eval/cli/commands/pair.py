@@ -96,6 +96,7 @@ def detect(
     import cdpipe
     from cdpipe.core.errors import MergeFailedError
     from cdpipe.mapping.session_check import is_same_session
+    from cdpipe.model.config import require_settings_are_read
     from eval.core.output import new_folder
 
     require_method_settings(settings)
@@ -105,6 +106,7 @@ def detect(
     origins_m = [how.subtracted_m(path) for how, path in zip(hows, (before, after), strict=True)]
     known = _read_known_merge(before_T_after, origins_m, assume_aligned=assume_aligned)
     cdpipe.require_usable(config, is_merge_known=known is not None)  # before hours of reading
+    require_settings_are_read(config, settings)
     try:
         with shown_warnings(), new_folder(out) as partial, shown_progress(quiet) as progress:
             earlier, later = open_inputs([before, after], hows, progress)

@@ -1,16 +1,19 @@
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from cdpipe.core.errors import InputError
+from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.geometry import Float64Array, make_pose, stream
 from cdpipe.mapping.mapping import build_map
-from cdpipe.mapping.session_check import UNITS, check_session, is_same_session, unit_hint
+from cdpipe.mapping.session_check import UNITS, are_swapped, check_session, is_same_session, unit_hint
 from cdpipe.model.config import MapConfig
 from cdpipe.model.types import PosedScan
+from cdpipe.pipeline import detection
 
 CAMERA_R_ROBOT = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # x right, y down, z forward
 
@@ -156,3 +159,37 @@ def test_one_recording_twice() -> None:
     other.clouds[0] = other.clouds[0] + 1e-9
     assert not is_same_session(Drive(), other)
     assert not is_same_session(Drive(), Drive(n_scans=11))
+
+
+def test_the_later_session_is_noticed_where_both_clocks_are_of_the_calendar() -> None:
+    def began(start_s: float | None) -> Drive:
+        drive = Drive(n_scans=2)
+        if start_s is not None:
+            drive.stamps_s = start_s + np.arange(2)
+        return drive
+
+    early, late = began(1.7e9), began(1.7e9 + 86_400)
+    assert are_swapped(late, early)
+    assert not are_swapped(early, late) and not are_swapped(early, early)
+    # a sensor without such a clock counts from when it was switched on, and a simulated session from its start
+    for other in (began(900.0), began(0.0), began(None)):
+        assert not are_swapped(early, other) and not are_swapped(other, early)
+    stored = Drive(n_scans=2)
+    stored.session = SimpleNamespace(provenance={"sensor_clock_start_ns": 1_600_000_000 * 10**9})
+    assert are_swapped(early, stored) and not are_swapped(stored, early)
+
+
+def test_detect_asks_whether_the_sessions_are_swapped(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(*_: object) -> None:
+        raise InputError("mapped")
+
+    early, late = Drive(n_scans=2), Drive(n_scans=2)
+    for drive, name, start_s in ((early, "monday", 1.7e9), (late, "tuesday", 1.7e9 + 86_400)):
+        drive.name, drive.stamps_s = name, start_s + np.arange(2)
+    monkeypatch.setattr(detection, "map_pair", stop)
+    asked = "monday was recorded before tuesday, by the clocks of both: is the earlier session the first"
+    with pytest.warns(InputWarning, match=asked), pytest.raises(InputError, match="mapped"):
+        detection.detect(late, early)
+    with warnings.catch_warnings(), pytest.raises(InputError, match="mapped"):
+        warnings.simplefilter("error")
+        detection.detect(early, late)
