@@ -82,7 +82,7 @@ def _start_s(source: ScanSource) -> float:
     if stamps_s is not None and len(stamps_s):
         return float(stamps_s[0])
     session = getattr(source, "session", None)
-    return 1e-9 * getattr(session, "provenance", {}).get("sensor_clock_start_ns", 0)
+    return float(1e-9 * getattr(session, "provenance", {}).get("sensor_clock_start_ns", 0))
 
 
 def unit_hint(before: PointMap, after: PointMap) -> str:
