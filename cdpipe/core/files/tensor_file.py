@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,7 @@ _DTYPES = {
     "U64": "<u8", "U32": "<u4", "U16": "<u2", "U8": "|u1", "BOOL": "|b1",
 }  # fmt: skip
 _METADATA = "__metadata__"
+_Read = Callable[[int, int], npt.NDArray[np.uint8]]  # new bytes of a file, from one place to another
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,9 @@ def read_tensors(
     try:
         if n_bytes < _LENGTH_BYTES:
             raise ValueError("cut short")
-        return _parse(np.memmap(path, np.uint8, "r"), expected, names)
+        # no memory map: a file that is cut meanwhile would end the process by SIGBUS
+        with path.open("rb") as file:
+            return _parse(partial(_read_part, file), n_bytes, expected, names)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}){end}") from error
     except ValueError as error:
@@ -70,30 +74,39 @@ def parse_tensors(
     Raises:
         ValueError: They are damaged, or hold other tensors than expected.
     """
-    return _parse(np.frombuffer(content, np.uint8), expected, names)
+    held = np.frombuffer(content, np.uint8)
+    return _parse(lambda begin, end: held[begin:end].copy(), len(held), expected, names)
+
+
+def _read_part(file: BinaryIO, begin: int, end: int) -> npt.NDArray[np.uint8]:
+    file.seek(begin)
+    content = np.empty(end - begin, np.uint8)
+    if file.readinto(content.data) != len(content):
+        raise ValueError("cut short while it is read")
+    return content
 
 
 def _parse(
-    content: npt.NDArray[np.uint8], expected: Expected, names: Collection[str] | None
+    read: _Read, n_bytes: int, expected: Expected, names: Collection[str] | None
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, str]]:
-    tensors, metadata, begin = _parse_table(content)
+    tensors, metadata, begin = _parse_table(read, n_bytes)
     check_types({name: tensor.type for name, tensor in tensors.items()}, expected, {})
     arrays = {}
     for name in tensors if names is None else names:
         tensor = tensors[name]
-        values = content[begin + tensor.begin : begin + tensor.end].view(tensor.type.dtype)
-        arrays[name] = np.array(values, dtype=tensor.type.dtype.newbyteorder("=")).reshape(tensor.type.shape)
+        values = read(begin + tensor.begin, begin + tensor.end).view(tensor.type.dtype)
+        arrays[name] = values.astype(tensor.type.dtype.newbyteorder("="), copy=False).reshape(tensor.type.shape)
     check_values(arrays, expected)
     return arrays, metadata
 
 
-def _parse_table(content: npt.NDArray[np.uint8]) -> tuple[dict[str, _Tensor], dict[str, str], int]:
+def _parse_table(read: _Read, n_bytes: int) -> tuple[dict[str, _Tensor], dict[str, str], int]:
     """Return the tensors of a file, its metadata, and where its data begins."""
-    n_table = int.from_bytes(content[:_LENGTH_BYTES].tobytes(), "little")
+    n_table = int.from_bytes(read(0, min(_LENGTH_BYTES, n_bytes)).tobytes(), "little")
     begin = _LENGTH_BYTES + n_table
-    if len(content) < _LENGTH_BYTES or n_table > _MAX_TABLE_BYTES or begin > len(content):
-        raise ValueError(f"its table is said to be {n_table} bytes, the file is {len(content)}")
-    table = parse_json(content[_LENGTH_BYTES:begin].tobytes())
+    if n_bytes < _LENGTH_BYTES or n_table > _MAX_TABLE_BYTES or begin > n_bytes:
+        raise ValueError(f"its table is said to be {n_table} bytes, the file is {n_bytes}")
+    table = parse_json(read(_LENGTH_BYTES, begin).tobytes())
     if not isinstance(table, dict):
         raise ValueError("its table is no JSON object")
     metadata = table.pop(_METADATA, {})
@@ -108,8 +121,8 @@ def _parse_table(content: npt.NDArray[np.uint8]) -> tuple[dict[str, _Tensor], di
                 f"{name[:40]!r} declares {n_declared} bytes at {tensor.begin} to {tensor.end}, not at {end}"
             )
         end = tensor.end
-    if begin + end != len(content):
-        raise ValueError(f"its tensors end at byte {begin + end}, the file at {len(content)}")
+    if begin + end != n_bytes:
+        raise ValueError(f"its tensors end at byte {begin + end}, the file at {n_bytes}")
     return tensors, metadata, begin
 
 

@@ -1,4 +1,5 @@
 import json
+import os
 import struct
 from pathlib import Path
 from typing import Any
@@ -91,3 +92,14 @@ def test_other_tensors_are_named(tmp_path: Path, change: dict[str, np.ndarray], 
     (tmp_path / "a").write_bytes(save({**ARRAYS, **change}))
     with pytest.raises(InputError, match=told):
         read_tensors(tmp_path / "a", SPECS)
+
+
+def test_a_file_that_is_cut_while_it_is_read_is_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(save({**ARRAYS, "images": np.zeros((4096, 8, 8), np.float16)}))
+
+    def cut(types: object) -> None:
+        os.truncate(path, 4096)  # its table is read, its tensors are not
+
+    with pytest.raises(InputError, match=r"a: damaged \(cut short while it is read\): make it again"):
+        read_tensors(path, cut, remedy="make it again")
