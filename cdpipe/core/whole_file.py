@@ -165,8 +165,10 @@ def _remove_unheld(partial: Path) -> None:
     handle = None
     try:
         if stat.S_ISREG(partial.lstat().st_mode):
-            with suppress(PermissionError):
-                handle = _locked(os.open(partial, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK))
+            for access in (os.O_RDWR, os.O_RDONLY):  # a network disk locks only what may be written
+                with suppress(PermissionError):
+                    handle = _locked(os.open(partial, access | os.O_NOFOLLOW | os.O_NONBLOCK))
+                    break
         if handle is None or _is_held(handle, partial):
             partial.unlink()
     except FileNotFoundError:

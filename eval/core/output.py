@@ -270,7 +270,9 @@ def _require_new(paths: Sequence[Path]) -> None:
 
 
 def unwritable(path: Path, error: OSError) -> InputError:
-    """Return the error that says why an output folder cannot be used."""
+    """Return the error that says why an output cannot be written; the path may be a file."""
+    if isinstance(error, BlockingIOError):
+        return InputError(f"{path}: another `tunnelcd` writes there: wait until it ends, or name another")
     return InputError(f"{path}: cannot write there ({error.strerror}): name a folder you may write to")
 
 

@@ -36,7 +36,7 @@ from eval.report.objects.report import draw_objects
 from eval.report.objects.tables import OBJECT_COLUMNS
 from eval.report.paper import time_table, volume_table
 from eval.report.regions.regions import REGION_COLUMNS, draw_regions
-from eval.report.render import render_page, write_file
+from eval.report.render import render_page, write_files
 from eval.report.scenarios import draw_scenarios
 from eval.report.settings.effects import draw_effects
 from eval.report.settings.factorial import draw_factorial, factorial_table
@@ -113,8 +113,8 @@ def write_page(
         raise InputError(
             f"{run}: a table lacks column {error}: `tunnelcd score {run}` makes the tables anew"
         ) from error
-    for name, file in files.items():
-        write_file(run / name, file)
+    # two that write at once meet at the page
+    write_files({run / name: files[name] for name in ("index.html", *files)})
     return run / "index.html"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.names import visible
 from cdpipe.core.whole_file import whole_file
 from eval.core.figures import compress_address
+from eval.core.output import unwritable
 
 _FILES = (
     "page.html", "index.html", "comparison.html", "answer.html", "story.html", "leaderboard.html", "parts.html",
@@ -45,10 +47,26 @@ def write_file(path: Path, content: str | bytes) -> None:
     """Write a file.
 
     Raises:
-        InputError: It cannot be written.
+        InputError: It cannot be written, or another process writes it.
     """
+    write_files({path: content})
+
+
+def write_files(files: Mapping[Path, str | bytes]) -> None:
+    """Write files of which none takes its place before all are written.
+
+    Another process is kept from all of them by the first one, which takes its place last: they never mix.
+
+    Raises:
+        InputError: One of them cannot be written, or another process writes it; all are left as they were.
+    """
+    path = Path()
     try:
-        with whole_file(path) as partial:
-            partial.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
+        with ExitStack() as stack:
+            for path, content in files.items():
+                partial = stack.enter_context(whole_file(path))
+                partial.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
+    except BlockingIOError as error:
+        raise unwritable(path, error) from error
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+        raise InputError(f"{error.filename or path}: cannot be written: {error.strerror}") from error

@@ -6,8 +6,9 @@ import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -78,7 +79,7 @@ def parse_tensors(
     return _parse(lambda begin, end: held[begin:end].copy(), len(held), expected, names)
 
 
-def _read_part(file: BinaryIO, begin: int, end: int) -> npt.NDArray[np.uint8]:
+def _read_part(file: BufferedReader, begin: int, end: int) -> npt.NDArray[np.uint8]:
     file.seek(begin)
     content = np.empty(end - begin, np.uint8)
     if file.readinto(content.data) != len(content):

@@ -5,7 +5,6 @@ The SDK silently drops the end of a truncated file, and a damaged OSF can termin
 
 from __future__ import annotations
 
-import mmap
 import struct
 import zlib
 from pathlib import Path
@@ -60,15 +59,16 @@ def check_pcap_integrity(path: Path) -> None:
     """
     if _size(path) < _PCAP_HEADER_BYTES:
         raise InputError(f"{path}: not a PCAP file: {_size(path)} bytes are less than its header")
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        magic = data[:4]
+    n_bytes = _size(path)
+    with path.open("rb") as file:  # no memory map: a file that is cut meanwhile would end the process by SIGBUS
+        head = file.read(12)
+        magic, order = head[:4], head[8:]
         if magic in _PCAP_ORDERS:
-            end, n_packets = _walk_pcap(data, _PCAP_ORDERS[magic])
-        elif magic == _PCAPNG_MAGIC and data[8:12] in _PCAPNG_ORDERS:
-            end, n_packets = _walk_pcapng(data, _PCAPNG_ORDERS[data[8:12]])
+            end, n_packets = _walk_pcap(file, n_bytes, _PCAP_ORDERS[magic])
+        elif magic == _PCAPNG_MAGIC and order in _PCAPNG_ORDERS:
+            end, n_packets = _walk_pcapng(file, n_bytes, _PCAPNG_ORDERS[order])
         else:
             raise InputError(f"{path}: neither PCAP nor PCAPNG: it does not begin as one")
-        n_bytes = len(data)
     if end != n_bytes:
         raise InputError(
             f"{path}: cut short or damaged after {n_packets} packets: copy it again, or save the whole packets with "
@@ -114,23 +114,29 @@ def _is_sound(file: BinaryIO, at: int, n_bytes: int) -> bool:
     return zlib.crc32(prefix + file.read(end - at - 4)) == int.from_bytes(file.read(4), "little")
 
 
-def _walk_pcap(data: mmap.mmap, order: str) -> tuple[int, int]:
+def _walk_pcap(file: BinaryIO, n_bytes: int, order: str) -> tuple[int, int]:
     """Return the offset of the end of the last complete packet, and the number of packets."""
     at, n_packets, lengths = _PCAP_HEADER_BYTES, 0, struct.Struct(f"{order}I")
-    while at + _PCAP_RECORD_BYTES <= len(data):
-        end = at + _PCAP_RECORD_BYTES + lengths.unpack_from(data, at + 8)[0]
-        if end > len(data):
+    while at + _PCAP_RECORD_BYTES <= n_bytes:
+        file.seek(at + 8)
+        if len(word := file.read(lengths.size)) < lengths.size:
+            break
+        end = at + _PCAP_RECORD_BYTES + lengths.unpack(word)[0]
+        if end > n_bytes:
             break
         at, n_packets = end, n_packets + 1
     return at, n_packets
 
 
-def _walk_pcapng(data: mmap.mmap, order: str) -> tuple[int, int]:
+def _walk_pcapng(file: BinaryIO, n_bytes: int, order: str) -> tuple[int, int]:
     """Return the offset of the end of the last complete block, and the number of packets."""
     at, n_packets, block = 0, 0, struct.Struct(f"{order}II")
-    while at + 12 <= len(data):
-        kind, n_bytes = block.unpack_from(data, at)
-        if n_bytes < 12 or at + n_bytes > len(data):
+    while at + 12 <= n_bytes:
+        file.seek(at)
+        if len(head := file.read(block.size)) < block.size:
             break
-        at, n_packets = at + n_bytes, n_packets + (kind in (3, 6))
+        kind, n_block = block.unpack(head)
+        if n_block < 12 or at + n_block > n_bytes:
+            break
+        at, n_packets = at + n_block, n_packets + (kind in (3, 6))
     return at, n_packets

@@ -195,6 +195,7 @@ def _serve(load: Callable[[], View], what: str, port: int, host: str, quiet: boo
     """Show a view until the user interrupts."""
     import time
 
+    from eval.core.terminal.interrupts import is_ended
     from sim.view.viewer import running_server, show
 
     with running_server(port, host) as server:
@@ -206,7 +207,8 @@ def _serve(load: Callable[[], View], what: str, port: int, host: str, quiet: boo
             while True:
                 time.sleep(1.0)
         except KeyboardInterrupt:
-            return
+            if is_ended():
+                raise
 
 
 def _tell_notes(shown: View) -> None:

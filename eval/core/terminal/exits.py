@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import NoReturn
 
 import typer
@@ -36,7 +36,7 @@ def input_errors() -> Iterator[None]:
         yield
     except TunnelcdError as error:
         for line in str(error).split("\n"):
-            sys.stderr.write(f"error: {visible(line)}\n")
+            _tell(f"error: {visible(line)}")
         raise SystemExit(2) from error
     except OSError as error:
         way = _WAYS.get(error.errno or 0)
@@ -44,11 +44,11 @@ def input_errors() -> Iterator[None]:
             raise
         unnamed = "a file" if error.errno in _FAILURES else "the output"
         what = visible(f"{error.filename2 or error.filename or unnamed}: {error.strerror}")
-        sys.stderr.write(f"error: {what}: {way}\n")
+        _tell(f"error: {what}: {way}")
         raise SystemExit(2) from error
     except MemoryError as error:  # numpy's says how much was asked for
         said = visible(" ".join(str(error).split())) or "no more can be had"
-        sys.stderr.write(f"error: more memory is needed than there is ({said}): give it smaller inputs\n")
+        _tell(f"error: more memory is needed than there is ({said}): give it smaller inputs")
         raise SystemExit(2) from error
 
 
@@ -79,7 +79,7 @@ def run_app(app: typer.Typer, name: str, words: Sequence[str], subcommands: Sequ
         # typer alone would draw a box; "Value error" is pydantic's, and choices come one a line
         message = " ".join(error.format_message().replace("Value error, ", "").split()).rstrip(".")
         if message:  # there is none for `tunnelcd` alone, which has printed its help
-            sys.stderr.write(f"error: {command}: {visible(message)}: `{command} --help` lists its arguments\n")
+            _tell(f"error: {command}: {visible(message)}: `{command} --help` lists its arguments")
         raise SystemExit(error.exit_code) from error
     raise SystemExit(code)
 
@@ -91,3 +91,8 @@ def _told_interrupts() -> Iterator[None]:
         yield
     except (typer.Abort, KeyboardInterrupt) as error:
         raise SystemExit(tell_interrupt("nothing was written")) from error
+
+
+def _tell(line: str) -> None:
+    with suppress(OSError):  # the terminal may be gone
+        sys.stderr.write(f"{line}\n")

@@ -27,6 +27,7 @@ _SAME_S = 5.0
 _IMPORT = "<frozen importlib._bootstrap>"
 _ENDING = ("SIGTERM", "SIGHUP")  # Windows knows no SIGHUP
 _raised: list[tuple[int, float]] = []  # interrupts of the program that runs: signal, monotonic time
+_waiting: list[int] = []  # SIGTERM or SIGHUP that waits for the end of an import
 
 
 @contextmanager
@@ -40,6 +41,7 @@ def interruptible() -> Iterator[None]:
         return
     with ExitStack() as stack:
         stack.callback(_raised.clear)
+        stack.callback(_waiting.clear)
         for number in (signal.SIGINT, *_ending_signals()):
             stack.callback(signal.signal, number, signal.signal(number, _interrupt_or_wait))
         yield
@@ -61,13 +63,20 @@ def tell_interrupt(what: str) -> int:
 
 @contextmanager
 def interrupts_kept() -> Iterator[None]:
-    """Raise `KeyboardInterrupt` again where another error came of it."""
+    """Raise `KeyboardInterrupt` again where another error came of it, as of a closed terminal that is written to."""
     try:
         yield
     except Exception as error:
+        if _waiting and not _raised:
+            _raised.append((_waiting[0], time.monotonic()))
         if _raised:
             raise KeyboardInterrupt from error
         raise
+
+
+def is_ended() -> bool:
+    """Return whether SIGTERM or SIGHUP interrupted the program, and not Ctrl-C."""
+    return bool(_raised) and _raised[0][0] != signal.SIGINT
 
 
 def raise_lost_interrupt() -> None:
@@ -125,6 +134,8 @@ def _interrupt_or_wait(number: int, frame: FrameType | None) -> None:
     if not _is_importing(frame):
         _raised.append((number, now))
         signal.default_int_handler(number, frame)
+    if number != signal.SIGINT:
+        _waiting.append(number)
     again = Timer(_AGAIN_S, _press_again, (number,))
     again.daemon = True
     again.start()

@@ -29,7 +29,7 @@ from eval.report.comparing.differences import (
     compare,
     condition_compared,
 )
-from eval.report.render import render_page, write_file
+from eval.report.render import render_page, write_files
 from eval.report.settings.effects import effect_chart, signed
 from eval.report.tables import Cell, Picture, Table
 from eval.running.results.sides import Side, cautions, only_in, short_names, why_no_times
@@ -97,8 +97,8 @@ def write_comparison(found: Comparison, folder: Path) -> Path:
     make_writable(folder)
     require_replaceable(folder / "comparison.csv", ",".join(COLUMNS[:2]).encode(), "table of `tunnelcd report A B`")
     require_replaceable(folder / "comparison.html", b"<title>tunnelcd: ", "page of `tunnelcd report A B`")
-    write_file(folder / "comparison.csv", found.table.to_csv(index=False))
-    write_file(folder / "comparison.html", render_page("comparison.html", _content(found)))
+    table, page = found.table.to_csv(index=False), render_page("comparison.html", _content(found))
+    write_files({folder / "comparison.html": page, folder / "comparison.csv": table})
     return folder / "comparison.html"
 
 

@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -117,6 +118,16 @@ def test_an_answer_is_shown_by_the_viewer(
     code, out, _ = command("view", "before", "after", answer[0], "--port", "0")
     assert code == 0
     assert re.search(r"http://localhost:\d+ \(Ctrl-C ends\)\n$", out)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_the_viewer_says_that_a_signal_ended_it(
+    answer: tuple[Path, str, str], command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("viser")
+    monkeypatch.setattr(time, "sleep", lambda _: signal.raise_signal(signal.SIGTERM))
+    code, _, err = command("view", "before", "after", answer[0], "--port", "0", "--quiet")
+    assert (code, err) == (143, "interrupted by SIGTERM; nothing half-written is left\n")
 
 
 def test_a_log_tells_each_stage_once(capsys: pytest.CaptureFixture[str]) -> None:

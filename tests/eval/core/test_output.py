@@ -12,7 +12,7 @@ import pytest
 
 from cdpipe.core.errors import InputError
 from cdpipe.core.whole_file import whole_file
-from eval.core.output import copy_folder, make_writable, new_files, new_folder
+from eval.core.output import copy_folder, make_writable, new_files, new_folder, unwritable
 
 
 def tree(folder: Path) -> list[str]:
@@ -241,3 +241,12 @@ def test_a_device_or_a_pipe_is_not_replaced(is_linked: bool, tmp_path: Path) -> 
         partial.write_text("{}")
     assert path.is_fifo() and path.is_symlink() == is_linked
     assert {each.name for each in tmp_path.iterdir()} == {"pipe", path.name}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
+def test_a_file_that_another_writes_is_told_as_such(tmp_path: Path) -> None:
+    path = tmp_path / "x.json"
+    with whole_file(path), pytest.raises(BlockingIOError) as blocked, whole_file(path):
+        pytest.fail("both write")
+    said = f"{path}: another `tunnelcd` writes there: wait until it ends, or name another"
+    assert str(unwritable(path, blocked.value)) == said

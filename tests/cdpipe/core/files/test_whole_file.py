@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from cdpipe.core import whole_file as module
 from cdpipe.core.whole_file import whole_file
 
 Link = Callable[[Path, Path], None]
@@ -49,3 +51,24 @@ def test_what_a_killed_writer_left_is_replaced_and_what_it_leads_to_stays(tmp_pa
         partial.write_text("new")
     assert (precious.read_text(), path.read_text()) == ("mine", "new")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["precious", "x.txt"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
+def test_a_network_disk_that_locks_only_what_may_be_written_keeps_two_apart_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fcntl = module.fcntl
+    flock = fcntl.flock
+
+    def flock_of_nfs(handle: int, how: int) -> None:
+        if fcntl.fcntl(handle, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        flock(handle, how)
+
+    monkeypatch.setattr(fcntl, "flock", flock_of_nfs)
+    path = tmp_path / "x.txt"
+    with whole_file(path) as partial:
+        partial.write_text("first")
+        with pytest.raises(BlockingIOError, match="another `tunnelcd` writes there"), whole_file(path):
+            pytest.fail("both write")
+    assert path.read_text() == "first"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 import sys
 import zlib
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from cdpipe.core.errors import InputError
+from cdpipe.io.ouster import integrity
 from cdpipe.io.ouster.captures import open_recording
 from cdpipe.io.ouster.osf import write_osf
 from cdpipe.io.ouster.recording import import_recording
@@ -162,6 +164,21 @@ def test_a_pcap_that_lost_packets_keeps_the_rest(capture: Path, tmp_path: Path) 
     assert (chunk.range_mm[:, :, 64:96] == 0).all()
     assert chunk.range_mm[0, :, 96:].any()
     np.testing.assert_allclose(np.diff(chunk.column_stamps_ns[0]), 195_312, atol=2)
+
+
+@pytest.mark.parametrize("kind", ["pcap", "pcapng"])
+def test_a_pcap_that_is_cut_while_it_is_read_is_named(
+    capture: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = capture if kind == "pcap" else pcapng_of(capture)
+    walk = getattr(integrity, f"_walk_{kind}")
+
+    def cut(*arguments: Any) -> Any:
+        os.truncate(source, 4096)
+        return walk(*arguments)
+
+    monkeypatch.setattr(integrity, f"_walk_{kind}", cut)
+    assert "cut short or damaged after " in said(lambda: open_recording(source))
 
 
 def test_metadata_of_a_pcap(capture: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import signal
 import subprocess
@@ -13,6 +14,9 @@ from pathlib import Path
 
 import pytest
 
+from cdpipe.core.errors import InputError
+from eval.core.terminal import interrupts
+from eval.core.terminal.exits import input_errors
 from eval.core.terminal.interrupts import interruptible, interrupts_held, interrupts_kept, raise_lost_interrupt
 
 LIBRARY = """import signal
@@ -113,3 +117,35 @@ def test_the_end_of_a_job_is_an_interrupt_and_its_repetition_leaves_the_cleaning
             signal.raise_signal(number)
     finally:
         signal.signal(number, before)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX")
+def test_an_error_of_a_terminal_that_was_closed_during_an_import_is_the_interrupt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "hangs_up.py").write_text("import signal\nsignal.raise_signal(signal.SIGHUP)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    timers: list[interrupts.Timer] = []
+    monkeypatch.setattr(interrupts.Timer, "start", lambda timer: timers.extend([timer]))
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        with interruptible():
+            with pytest.raises(KeyboardInterrupt), interrupts_kept():
+                importlib.import_module("hangs_up")
+                raise OSError(errno.EIO, "Input/output error")  # of the next line that is told
+            assert len(timers) == 1
+            assert interrupts.tell_interrupt("nothing was written") == 128 + signal.SIGHUP
+        with pytest.raises(OSError, match="Input/output"), interruptible(), interrupts_kept():
+            raise OSError(errno.EIO, "Input/output error")
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_an_error_ends_with_its_code_where_standard_error_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(_: str) -> int:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(sys.stderr, "write", gone)
+    with pytest.raises(SystemExit) as ended, input_errors():
+        raise InputError("x: missing")
+    assert ended.value.code == 2
