@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from cdpipe.core import whole_file as module
 from cdpipe.core.whole_file import whole_file
 
 Link = Callable[[Path, Path], None]
@@ -57,7 +56,7 @@ def test_what_a_killed_writer_left_is_replaced_and_what_it_leads_to_stays(tmp_pa
 def test_a_network_disk_that_locks_only_what_may_be_written_keeps_two_apart_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fcntl = module.fcntl
+    fcntl = pytest.importorskip("fcntl")
     flock = fcntl.flock
 
     def flock_of_nfs(handle: int, how: int) -> None:

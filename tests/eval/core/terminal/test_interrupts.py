@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Timer
 
 import pytest
 
@@ -125,8 +126,8 @@ def test_an_error_of_a_terminal_that_was_closed_during_an_import_is_the_interrup
 ) -> None:
     (tmp_path / "hangs_up.py").write_text("import signal\nsignal.raise_signal(signal.SIGHUP)\n")
     monkeypatch.syspath_prepend(tmp_path)
-    timers: list[interrupts.Timer] = []
-    monkeypatch.setattr(interrupts.Timer, "start", lambda timer: timers.extend([timer]))
+    timers: list[Timer] = []
+    monkeypatch.setattr(Timer, "start", lambda timer: timers.extend([timer]))
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     try:
         with interruptible():
