@@ -23,6 +23,7 @@ def main() -> None:
     """Run the command line and exit; an interrupt before it runs ends with exit code 130, as one while it runs."""
     open_closed_streams()
     handlers = {number: signal.signal(number, _leave) for number in _heeded_signals()}
+    _require_working_folder()
     for name in _PACKAGES:
         if other := find_hiding(name):
             sys.stderr.write(
@@ -76,6 +77,15 @@ def _heeded_signals() -> list[int]:
     """Return Ctrl-C and those signals that would end this process; `nohup` lets it ignore SIGHUP."""
     ending = [int(getattr(signal, name)) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     return [int(signal.SIGINT), *(number for number in ending if signal.getsignal(number) == signal.SIG_DFL)]
+
+
+def _require_working_folder() -> None:
+    """End in one line where there is none: a library that is imported later ends the process with words of its own."""
+    try:
+        Path.cwd()
+    except OSError as error:
+        sys.stderr.write("error: the working folder was removed: change to one that is there\n")
+        raise SystemExit(2) from error
 
 
 def _leave(number: int, _frame: FrameType | None) -> None:

@@ -143,6 +143,8 @@ def _interrupt_or_wait(number: int, frame: FrameType | None) -> None:
 
 def _press_again(number: int) -> None:
     """Send a signal to the main thread, so that what it waits for ends; not to the thread that calls this."""
+    if signal.getsignal(number) == signal.SIG_DFL:
+        return  # the program was interrupted meanwhile, and is ending
     to = main_thread().ident
     if to is not None and hasattr(signal, "pthread_kill"):
         signal.pthread_kill(to, number)

@@ -336,3 +336,17 @@ def test_a_closed_terminal_leaves_a_command_of_nohup_alone() -> None:
         capture_output=True, text=True, check=True, cwd=Path(__file__).parents[3],
     )  # fmt: skip
     assert (ended.stdout, ended.stderr) == ("went on\n", "")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows removes no folder in which a program works")
+def test_a_working_folder_that_was_removed_is_one_line(tmp_path: Path) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    program = "import os, sys\nos.rmdir(os.getcwd())\nfrom cdpipe.core.program import main\nmain()\n"
+    ended = subprocess.run(
+        [sys.executable, "-c", program, "simulate", "smoke/one_box", "--out", "x"],
+        capture_output=True, text=True, check=False, cwd=gone,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
+    )  # fmt: skip
+    said = "error: the working folder was removed: change to one that is there\n"
+    assert (ended.returncode, ended.stdout, ended.stderr) == (2, "", said)
