@@ -151,7 +151,7 @@ def arrange_by_source(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def main(
-    out: Annotated[Path, typer.Option(help="folder for second-returns.csv and second-returns.md")],
+    out: Annotated[Path, typer.Option(help="folder for second-returns.csv")],
     data: Annotated[Path | None, typer.Option(help=f"folder of the real recording [${DATA_VARIABLE}]")] = None,
 ) -> None:
     """Print and write the comparison."""
@@ -162,10 +162,8 @@ def main(
     real = read_real_returns(pcap)
     drives = [plan_drive(family, seed, real.first.sensor, PROFILE) for family, seed in WORLDS]
     table = compare(real, drives)
-    text = format_markdown(arrange_by_source(table))
     write_file(out / "second-returns.csv", table.to_csv(index=False, float_format="%.5g"))
-    write_file(out / "second-returns.md", text)
-    typer.echo(text, nl=False)
+    typer.echo(format_markdown(arrange_by_source(table)), nl=False)
 
 
 if __name__ == "__main__":

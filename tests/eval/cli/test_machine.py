@@ -309,8 +309,11 @@ def test_an_interrupt_is_one_line_from_the_first_moment_on(moment: str, name: st
             "from cdpipe.core.program import main\nmain()\n"
         ),
     }[moment]
+    # the tests may run under `nohup`, which has every child ignore SIGHUP
+    usual = "default_int_handler" if name == "SIGINT" else "SIG_DFL"
+    heeded = f"import signal; signal.signal(signal.{name}, signal.{usual})\n"
     process = subprocess.Popen(
-        [sys.executable, "-c", program, "doctor"],
+        [sys.executable, "-c", heeded + program, "doctor"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[3],
     )  # fmt: skip
     assert process.stdout is not None
