@@ -77,11 +77,16 @@ def test_evidence(value: float, told: str | None) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "most"),
-    [("map_points_before", 50), ("map_points_after", 70), ("bytes_map_before", 3200), ("bytes_regions_before", 3200)],
+    ("name", "most", "each"),
+    [
+        ("map_points_before", 50, "one"),
+        ("map_points_after", 70, "one"),
+        ("bytes_map_before", 3200, "64 bytes"),
+        ("bytes_regions_before", 3200, "64 bytes"),
+    ],
 )
-def test_no_more_is_stated_of_a_map_than_its_session_has(name: str, most: float) -> None:
-    told_of = rf"evidence\.{name} = {most}: expected at most {most}, .* for each pixel"
+def test_no_more_is_stated_of_a_map_than_its_session_has(name: str, most: float, each: str) -> None:
+    told_of = rf"evidence\.{name} = {most}: expected at most {most}, {each} for each pixel"
     for value, told in ((most, None), (NAN, None), (np.nextafter(most, INF), told_of)):
         with taken_or_refused(told):
             module._check_stated({name: value, "overlap": 1e9}, {"before": 50, "after": 70})

@@ -88,3 +88,10 @@ def test_what_cannot_be_a_size_is_refused(
     damaged = replace(whole, objects=(change(whole.objects[0]), whole.objects[1]))
     with pytest.raises(InputError, match=f"answers: not an answer to this pair: {words}"):
         check_answer(Answer("ok", "", "other", damaged, {}, {}), truth, Path("answers"))
+
+
+def test_places_are_compared_with_the_pair_unless_a_plan_made_the_answer_of_it(tiny_pair: Path) -> None:
+    truth, answer = load_ground_truth(tiny_pair), Answer("ok", "", "other", report(), {}, {})
+    check_answer(answer, truth, Path("answers"), is_of_pair=True)
+    with pytest.raises(InputError, match="answers: not an answer to this pair: "):
+        check_answer(answer, truth, Path("answers"))

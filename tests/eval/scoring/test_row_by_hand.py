@@ -545,6 +545,17 @@ def test_a_figure_at_the_limit_is_taken_and_one_above_is_refused(report: ChangeR
             check_answer(answer, truth, Path("answer"))
 
 
+def test_a_region_that_asks_for_more_points_than_there_are_pixels_is_refused(
+    report: ChangeReport, truth: GroundTruth
+) -> None:
+    points = truth.sessions["before"].scoring_points
+    n_pixels = points.n_scans * points.n_pixels
+    for asked, is_refused in ((n_pixels, False), (n_pixels + 1, True)):
+        answer = Answer("ok", "", "mine", replace(report, figures={"asked_points": np.full(7, asked)}), {}, {})
+        with pytest.raises(InputError, match="figure_asked_points: ") if is_refused else nullcontext():
+            check_answer(answer, truth, Path("answer"))
+
+
 @pytest.mark.parametrize(
     "scenario", [{}, {"before": None, "after": {"odometry": "kiss-icp"}, "sensor": {"profile": None}}]
 )

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from eval.tables.alarms import count_alarms, may_be_refused
+from eval.tables.alarms import count_alarms, may_be_refused, with_counted_alarms
 
 NAN = float("nan")
 # kind of pair, status, whether nothing changed, whether a region was reported, objects; and whether that is an alarm
@@ -68,3 +68,14 @@ def test_alarms_that_were_read_back(cells: list[object], expected: list[float]) 
 def test_a_refusal_can_be_right_where_scans_cannot_tell() -> None:
     assert may_be_refused(results()).tolist() == results()["pair_kind"].isin(["smooth", "disjoint"]).tolist()
     assert not may_be_refused(results().drop(columns="pair_kind")).any()
+
+
+def test_alarms_are_counted_in_results_but_where_the_plan_ends_at_the_merge() -> None:
+    table = results()
+    for plan in (None, {}, {"until": "detect"}, {"name": "merge"}, ["merge"]):
+        counted = with_counted_alarms(table, plan)
+        np.testing.assert_array_equal(counted["is_alarm"], table["expected"])
+        pd.testing.assert_frame_equal(counted.drop(columns="is_alarm"), table.drop(columns="is_alarm"))
+    assert with_counted_alarms(table, {"until": "merge"}) is table
+    without = table.drop(columns="is_alarm")
+    assert with_counted_alarms(without, {}) is without

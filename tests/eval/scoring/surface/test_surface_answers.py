@@ -106,6 +106,16 @@ def test_an_answer_that_ends_at_the_merge_has_no_figures_of_the_rock() -> None:
     assert (found.columns, found.changes, found.windows) == ({}, [], [])
 
 
+def test_a_field_that_nobody_asked_for_is_scored_without_a_number_of_changes() -> None:
+    counts = []
+    for family in ("surface/a", "regions/a"):
+        truth = wall_truth({}, family=family)
+        answer = Answer("ok", "", "m", report_of(truth, true_field(truth)), {}, {})
+        counts.append(score_surface(answer, truth, 40.0).columns["n_surface_changes"])
+    assert counts[0] == 0
+    assert np.isnan(counts[1])
+
+
 def test_the_seconds_are_the_answers_own_and_rates_need_a_path_and_an_answer() -> None:
     truth = wall_truth({})
     field = replace(true_field(truth), region=np.zeros(2400, np.int32), regions=field_of().regions[:1])
