@@ -34,7 +34,9 @@ from scenarios.references import file_digests
 _AHEAD = 2  # pairs that wait in a cluster for each of its threads
 _LOOK_S = 0.5
 _NO_WORKERS_S = 60.0
-_TRIES = 3  # of a suspect: with its worker, and twice alone should a worker be killed that only watches
+# Of a suspect: with its worker, and then alone, where somebody else may still kill the worker that only watches. With
+# three, a soak that killed the only worker every six seconds made a cell of ten seconds a row `worker_died`.
+_TRIES = 6
 _TRACE, _TOKEN = ".begun", ".workers"
 
 
@@ -201,7 +203,7 @@ def work_on(document: str) -> str:
                 death = _death_of_opening(task, here)
             death_of_cell = death or _death_of_cell(task, here, each, trace)
             if death_of_cell:
-                here.write_died(each, f"killed its worker, and again where it ran alone ({death_of_cell})")
+                here.write_died(each, death_of_cell)
         if pair.keep != "sessions":
             drop_pair(run, pair.name, pair.seed, pair.keep)
     return ""
@@ -217,13 +219,13 @@ def open_and_run(document: str) -> None:
 
 
 def _death_of_opening(task: Task, here: PairRun) -> str:
-    """Simulate and open a pair, first in a process of its own where that killed a worker; return the cause of death."""
+    """Simulate and open a pair, first in a process of its own where that killed a worker; return what is said of it."""
     if here.is_open:
         return ""
     trace = RunFolder(task.folder).pair(task.pair.name, task.pair.seed).with_name(f".{task.pair.seed}{_TRACE}")
     with _traced(trace) as n_begun:
         if n_begun >= _TRIES:
-            return "several times"
+            return f"its worker died {n_begun} times while its pair was made"
         if n_begun and (death := _death_alone(_only(task))):
             return death
         here.open()
@@ -231,10 +233,10 @@ def _death_of_opening(task: Task, here: PairRun) -> str:
 
 
 def _death_of_cell(task: Task, here: PairRun, each: Todo, trace: Path) -> str:
-    """Run a cell here, or in a process of its own where a worker died during it; return the cause of death."""
+    """Run a cell here, or in a process of its own where a worker died during it; return what is said of its death."""
     with _traced(trace) as n_begun:
         if n_begun >= _TRIES:
-            return "several times"
+            return f"its worker died {n_begun} times during it"
         if n_begun:
             return _death_alone(_only(task, each))
         here.do(each)
@@ -242,11 +244,11 @@ def _death_of_cell(task: Task, here: PairRun, each: Todo, trace: Path) -> str:
 
 
 def _death_alone(task: Task) -> str:
-    """Run a task in a process of its own, and return what killed it, "" if nothing did."""
+    """Run a task in a process of its own, and return what is said of its death, "" if it lives."""
     try:
         run_isolated(open_and_run, task.as_json())
     except ProcessDiedError as death:
-        return str(death)
+        return f"killed its worker, and again where it ran alone ({death})"
     return ""
 
 

@@ -4,6 +4,7 @@ import errno
 import importlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -494,12 +495,11 @@ def test_what_was_begun_too_often_is_not_begun_again(tmp_path: Path, plan: Plan,
         "pair": run.pair("smoke/one_box", 20000).with_name(".20000.begun"),
     }
     traces[place].parent.mkdir(parents=True)
-    traces[place].write_text("3")
+    traces[place].write_text("6")
     assert work_on(task.as_json()) == ""
-    states = [
-        json.loads(run.cell("smoke/one_box", 20000, name).read_text())["row"]["status"] for name in (FIRST, SECOND)
-    ]
-    assert states == ["worker_died", "ok" if place == "cell" else "worker_died"]
+    rows = [json.loads(run.cell("smoke/one_box", 20000, name).read_text())["row"] for name in (FIRST, SECOND)]
+    assert [row["status"] for row in rows] == ["worker_died", "ok" if place == "cell" else "worker_died"]
+    assert re.fullmatch("its worker died 6 times (during it|while its pair was made)", rows[0]["error"])
     # what an earlier run left behind counts no more
     traces[place].write_text("3")
     remove_traces(run)
