@@ -94,14 +94,18 @@ def _cast_along(drive: Drive, settings: Sensor) -> Revolutions:
     return gather_revolutions(recorded.sensor, [cast_revolution(recorded, number)[1] for number in numbers])
 
 
+def find_data(given: Path | None) -> Path | None:
+    """Return the folder of real recordings: the given one, else that of `DATA_VARIABLE`, else None."""
+    told = os.environ.get(DATA_VARIABLE)
+    return given or (Path(told) if told else None)
+
+
 def main(
     out: Annotated[Path, typer.Option(help="folder for reality.csv, reality-novelty.csv, their .md and plots")],
     data: Annotated[Path | None, typer.Option(help=f"folder of the real recording [${DATA_VARIABLE}]")] = None,
 ) -> None:
     """Print and write the comparison."""
-    given = os.environ.get(DATA_VARIABLE)
-    folder = data or (Path(given) if given else None)
-    pcap = find_recording(folder)
+    pcap = find_recording(find_data(data))
     make_writable(out)
     real = read_real_revolution(pcap)
     drives = [plan_drive(family, seed, real.sensor, PROFILE) for family, seed in WORLDS]

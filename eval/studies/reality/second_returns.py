@@ -10,7 +10,6 @@ tunnel of a validation seed, both in clear air.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -28,7 +27,7 @@ from eval.core.output import make_writable
 from eval.core.statistics import mean
 from eval.core.terminal.exits import run_program
 from eval.report.render import write_file
-from eval.studies.reality.reality import DATA_VARIABLE
+from eval.studies.reality.reality import DATA_VARIABLE, find_data
 from eval.studies.reality.scenes import cast_at_origin, change_effects, find_recording, plan_drive, rebuild
 from eval.studies.reality.sensor_measures import Revolutions, destagger, find_edges
 from eval.studies.reality.tables import format_markdown
@@ -155,9 +154,7 @@ def main(
     data: Annotated[Path | None, typer.Option(help=f"folder of the real recording [${DATA_VARIABLE}]")] = None,
 ) -> None:
     """Print and write the comparison."""
-    given = os.environ.get(DATA_VARIABLE)
-    folder = data or (Path(given) if given else None)
-    pcap = find_recording(folder, RECORDING)
+    pcap = find_recording(find_data(data), RECORDING)
     make_writable(out)
     real = read_real_returns(pcap)
     drives = [plan_drive(family, seed, real.first.sensor, PROFILE) for family, seed in WORLDS]

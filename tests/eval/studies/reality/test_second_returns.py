@@ -1,6 +1,5 @@
 """Figures of second returns: closed forms on synthetic data, those of the real revolution, the command."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from typer.testing import CliRunner
 from cdpipe.core.errors import InputError
 from cdpipe.sensor.ouster import load_profile
 from eval.studies.reality import second_returns
-from eval.studies.reality.reality import DATA_VARIABLE
+from eval.studies.reality.reality import find_data
 from eval.studies.reality.scenes import find_recording, plan_drive
 from eval.studies.reality.second_returns import (
     PROFILE,
@@ -80,23 +79,22 @@ def test_no_second_return_is_no_figure_of_them() -> None:
     assert found.drop("beams with a second return, of those with a first").isna().all()
 
 
-def find_data() -> Path:
-    folder = os.environ.get(DATA_VARIABLE)
+def real_recording() -> Path:
     try:
-        return find_recording(Path(folder) if folder else None, RECORDING)
+        return find_recording(find_data(None), RECORDING)
     except InputError as error:
         pytest.skip(str(error))
 
 
 def test_figures_of_the_real_revolution() -> None:
-    found = values(read_real_returns(find_data()))
+    found = values(read_real_returns(real_recording()))
     assert found["beams with a second return, of those with a first"] == pytest.approx(0.00264, abs=1e-5)
     assert found["of these, the second is stronger"] == 0.0
     assert found["distance between both returns, 50th percentile, m"] == pytest.approx(0.798)
 
 
 def test_the_simulator_makes_as_many_second_returns_as_the_real_unit(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = read_real_returns(find_data())
+    real = read_real_returns(real_recording())
     monkeypatch.setattr(second_returns, "WORLDS", (("narrow", 10001),))
     table = arrange_by_source(compare(real, [plan_drive("narrow", 10001, real.first.sensor, PROFILE)]))
     assert list(table.columns) == ["figure", "real", "real scene", "narrow 10001"]
