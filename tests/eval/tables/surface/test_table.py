@@ -64,23 +64,31 @@ def test_null_windows_that_are_not_covered_lower_no_threshold() -> None:
 
 
 def test_the_threshold_rises_where_more_than_15_percent_of_all_null_windows_are_beyond_it() -> None:
-    covered = np.full(20, 0.01)
+    covered, none = np.full(20, 0.01), np.zeros(0)
     # 3 of 20 are 15 %, and equal but for rounding is not beyond
-    assert find_threshold(covered, np.array([0.01 + 1e-10] * 17 + [0.02] * 3)) == pytest.approx((0.01, 0.15))
-    raised, share = find_threshold(covered, np.array([0.01] * 16 + [0.02] * 4))
+    assert find_threshold(covered, none, np.array([0.01 + 1e-10] * 17 + [0.02] * 3)) == pytest.approx((0.01, 0.15))
+    raised, share = find_threshold(covered, none, np.array([0.01] * 16 + [0.02] * 4))
     assert (raised, share) == pytest.approx((0.02, 0.0))
-    raised, share = find_threshold(covered, np.array([0.0] * 30 + [0.02] * 9 + [0.03] * 2))
+    raised, share = find_threshold(covered, none, np.array([0.0] * 30 + [0.02] * 9 + [0.03] * 2))
     assert (raised, share) == pytest.approx((0.02, 2 / 41))
-    assert np.isnan(find_threshold(np.zeros(0), np.ones(3))).all()
+    assert np.isnan(find_threshold(none, np.full(20, 0.01), np.ones(20))).all()
 
 
-def test_windows_of_checks_set_no_threshold_but_count_as_false_alarms() -> None:
+def test_the_threshold_is_the_larger_one_of_those_by_either_kind_of_null_window() -> None:
+    null, loud = np.linspace(0.0, 0.02, 21), np.linspace(0.0, 0.04, 21)
+    everything = np.concatenate([null, loud])
+    assert find_threshold(null, loud, everything) == pytest.approx((0.038, 1 / 42))
+    assert find_threshold(loud, null, everything) == pytest.approx((0.038, 1 / 42))
+    assert find_threshold(null, loud[2:], np.zeros(40))[0] == pytest.approx(0.019)  # 19 are too few
+
+
+def test_windows_of_checks_count_as_false_alarms_and_few_of_them_set_no_threshold() -> None:
     checks = [{**window(0.0, 0.5, seed=k), "is_check": True} for k in range(3)]
     rows = [{**row, "is_check": False} for row in (*null_windows(), window(0.02, 0.0195), window(0.02, 0.0191))]
     (row,) = detection_limits(pd.DataFrame([*rows, *checks]))
     # that of 20 mm and three more are 4 of 24 beyond 19 mm, 17 %: it rises
     assert (row["threshold_m"], row["n_null_windows"], row["false_share"]) == pytest.approx((0.5, 21, 0.0))
-    assert row["found_share"] == 0.0
+    assert (row["found_share"], row["n_check_windows"]) == (0.0, 3)
     (row,) = detection_limits(pd.DataFrame([*rows, *checks[:2]]))
     assert (row["threshold_m"], row["false_share"], row["found_share"]) == pytest.approx((0.019, 3 / 23, 1.0))
     # rows of an older run do not say so; of both together those that do count
@@ -88,7 +96,16 @@ def test_windows_of_checks_set_no_threshold_but_count_as_false_alarms() -> None:
     assert (row["threshold_m"], row["n_null_windows"]) == pytest.approx((0.019, 21))
 
 
-def test_guesses_where_no_threshold_comes_from_pay_and_the_share_of_false_alarms_tells() -> None:
+def test_windows_of_checks_that_are_not_covered_lower_no_threshold() -> None:
+    rows = [{**row, "is_check": False} for row in (*null_windows(), window(0.02, 0.03))]
+    loud = [{**window(0.0, 0.002 * k, seed=k), "is_check": True} for k in range(21)]
+    left_out = [{**window(0.0, 0.0, seed=k, cover=0.4), "is_check": True} for k in range(60)]
+    (row,) = detection_limits(pd.DataFrame([*rows, *loud, *left_out]))
+    assert (row["threshold_m"], row["n_check_windows"], row["found_share"]) == (pytest.approx(0.038), 21, 0.0)
+
+
+@pytest.mark.parametrize("guessed_share", [0.08, 0.28, 0.5, 1.0])
+def test_guesses_where_few_thresholds_come_from_do_not_pay(guessed_share: float) -> None:
     def judge(guessed_share: float) -> dict:
         n_guessed = round(50 * guessed_share)
         nulls = [{**window(0.0, 0.001 * (k % 8), seed=k), "is_check": False} for k in range(100)]
@@ -100,10 +117,9 @@ def test_guesses_where_no_threshold_comes_from_pay_and_the_share_of_false_alarms
         moved = [{**window(0.02, 0.02 if k < n_found else 0.0, seed=k), "is_check": False} for k in range(10)]
         return detection_limits(pd.DataFrame([*nulls, *checks, *moved]))[0]
 
-    honest, guessing, loud = judge(0.0), judge(0.28), judge(0.5)
-    assert np.isnan(honest["limit_m"]) and honest["false_share"] == 0.0
-    assert guessing["limit_m"] == 0.02 and guessing["false_share"] == pytest.approx(14 / 150)
-    assert np.isnan(loud["limit_m"]) and loud["threshold_m"] == pytest.approx(0.5)
+    honest, guessing = judge(0.0), judge(guessed_share)
+    assert (honest["found_share"], honest["threshold_m"], honest["false_share"]) == pytest.approx((0.4, 0.007, 0.0))
+    assert (guessing["found_share"], guessing["threshold_m"]) == pytest.approx((0.0, 0.5))
 
 
 @pytest.mark.parametrize(
