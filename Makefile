@@ -12,6 +12,7 @@ LOWEST := .venv-lowest
 NEWEST := .venv-newest
 AUDIT := .venv-audit
 MUTANTS := .venv-mutants
+EVO := .venv-evo
 PYTHONS ?= python3.11 python3.13
 # One process per core and one thread in each; the tests of one file stay in one process and share what it has set up.
 # Files begin in the order of tests/conftest.py, the long ones first.
@@ -19,7 +20,7 @@ PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(TEST_PROCESSES) --dist l
 
 FUZZ_INPUTS ?= 100000
 
-.PHONY: setup demo test test-lowest lowest test-newest test-pythons audit fuzz soak load sweep mutants check report clean
+.PHONY: setup demo test test-lowest lowest test-newest test-pythons test-evo audit fuzz soak load sweep mutants check report clean
 
 setup: $(VENV)/.installed-dev
 
@@ -85,6 +86,15 @@ $(PYTHONS:%=.venv-%/.installed): .venv-%/.installed: pyproject.toml constraints.
 	.venv-$*/bin/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt --editable .
 	touch $@
 
+# evo reads our trajectories. Its environment is its own: it is GPL, and needs a newer rosbags than the pinned one.
+test-evo: $(VENV)/.installed-dev $(EVO)/.installed
+	TUNNELCD_EVO=$(EVO)/bin $(BIN)/python -m pytest tests/eval/converting/test_evo.py
+
+$(EVO)/.installed:
+	$(PYTHON) -m venv --clear $(EVO)
+	$(EVO)/bin/python -m pip --disable-pip-version-check install --quiet evo==1.38.1
+	touch $@
+
 # Licences of all packages, and known vulnerabilities among the pins; the latter need a network.
 audit: $(VENV)/.installed-dev $(AUDIT)/.installed
 	$(AUDIT)/bin/python tests/audit.py $(BIN)/python
@@ -138,5 +148,5 @@ report: $(VENV)/.installed
 	$(BIN)/tunnelcd report $(OUT)
 
 clean:
-	rm -rf mutants $(VENV) $(LOWEST) $(NEWEST) $(AUDIT) $(MUTANTS) .venv-python* build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf mutants $(VENV) $(LOWEST) $(NEWEST) $(AUDIT) $(MUTANTS) $(EVO) .venv-python* build *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
