@@ -18,7 +18,7 @@ pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
 from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.io.foreign import HowToRead, convert_recording, folder_of_options, guess_format
 from cdpipe.io.foreign.clouds import point_times, stamps_of_names
-from cdpipe.io.foreign.points_files import read_e57
+from cdpipe.io.foreign.points_files import cloud_reader, read_e57
 from cdpipe.io.foreign.sniff import find_scans
 from cdpipe.io.out.kitti import write_kitti as write_kitti_out
 from cdpipe.io.out.scans import Outgoing
@@ -350,3 +350,16 @@ def test_a_pipe_in_the_place_of_a_scan_is_not_waited_for(write: Callable[..., Pa
     os.mkfifo(scan)
     write_trajectory(tmp_path / "poses.txt", MADE.stamps_s)
     assert "it is a device or a pipe" in said(folder, HowToRead(format=name, trajectory=tmp_path / "poses.txt"))
+
+
+@pytest.mark.parametrize("year", [2010, 2023])
+def test_a_real_las_of_another_program_reads_as_with_laspy(year: int) -> None:
+    if "TUNNELCD_REAL_DATA" not in os.environ:
+        pytest.skip("TUNNELCD_REAL_DATA is unset: real scans are not at hand")
+    laspy = pytest.importorskip("laspy")
+    path = Path(os.environ["TUNNELCD_REAL_DATA"]) / "two_epochs" / f"autzen-bmx-{year}.las"
+    theirs = laspy.read(path)
+    cloud = cloud_reader("las", path.parent)(path)
+    assert len(cloud.points) > 600
+    np.testing.assert_array_equal(cloud.points, theirs.xyz)
+    np.testing.assert_array_equal(cloud.intensity, theirs.intensity)
