@@ -28,7 +28,7 @@ from cdpipe.mapping.session_check import are_swapped, unit_hint
 from cdpipe.merge.coverage import measure_coverage
 from cdpipe.merge.merge import merge_maps, take_known_merge
 from cdpipe.methods.registry import list_extras, load_source
-from cdpipe.model.config import PipelineConfig, Site, load_config, require_settings_are_read
+from cdpipe.model.config import PipelineConfig, Site, load_config, require_settings_are_read, warn_of_unread_settings
 from cdpipe.model.report import ChangeRegions, ChangeReport, SurfaceField
 from cdpipe.model.types import DescriptorSet, MappedSession, MergedMaps, ScanSource
 from cdpipe.pipeline.hooks import Done, Hooks
@@ -77,6 +77,7 @@ def detect(
     config = load_config(preset, settings, site)
     require_usable(config, is_merge_known=known is not None)
     require_settings_are_read(config, settings)
+    warn_of_unread_settings(config, settings)
     use_threads(THREADS)
     hooks = hooks or Hooks()
     (before, stored_before), (after, stored_after) = (_open(each, config) for each in (before, after))

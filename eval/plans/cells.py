@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 from cdpipe.core.errors import InputError
-from cdpipe.model.config import PipelineConfig, explain_idle_setting, list_idle_settings
+from cdpipe.model.config import (
+    PipelineConfig,
+    explain_idle_setting,
+    explain_unread_setting,
+    list_idle_settings,
+    list_unread_settings,
+)
 from eval.plans.plan import Plan, list_methods
 from eval.plans.variants import Cell, Method
 
@@ -32,23 +38,39 @@ def expand_cells(plan: Plan) -> list[Cell]:
             for seed in plan.seeds[: world.n_seeds]
             for method, config in methods
         ]
-    mistakes += _find_idle_settings(every)
+    idle = _find_settings(every, list_idle_settings)
+    mistakes += (explain_idle_setting(each, [config.regions.source for config in own]) for each, own in idle.items())
     if mistakes:
         raise InputError("\n".join(dict.fromkeys(mistakes)))
     return found
 
 
-def _find_idle_settings(methods: Sequence[tuple[Method, PipelineConfig]]) -> Iterator[str]:
-    """Yield a line on each setting that no method of a plan reads: one `set` is for all of them."""
-    sources: dict[str, list[str]] = {}
+def explain_unread_settings(plan: Plan) -> list[str]:
+    """Return a line on each setting that the extraction of no method of a plan reads: it only makes equal rows.
+
+    Raises:
+        InputError: As `expand_cells`.
+    """
+    every = [(method, method.config()) for world in plan.worlds for method in list_methods(plan, world)]
+    found = _find_settings(every, list_unread_settings)
+    return [
+        explain_unread_setting(setting, [config.extract.method for config in own]) for setting, own in found.items()
+    ]
+
+
+def _find_settings(
+    methods: Sequence[tuple[Method, PipelineConfig]], list_of: Callable[[PipelineConfig, Sequence[str]], list[str]]
+) -> dict[str, list[PipelineConfig]]:
+    """Return the settings that no method of a plan reads, each with the methods: one `set` is for all of them."""
+    found: dict[str, list[PipelineConfig]] = {}
     read: set[str] = set()
     for method, config in methods:
         given = (*method.shared, *method.named, *method.silent)
-        idle = list_idle_settings(config, given)
+        idle = list_of(config, given)
         read.update(each for each in given if each not in idle)
         for setting in idle:
-            sources.setdefault(setting, []).append(config.regions.source)
-    yield from (explain_idle_setting(setting, own) for setting, own in sources.items() if setting not in read)
+            found.setdefault(setting, []).append(config)
+    return {setting: own for setting, own in found.items() if setting not in read}
 
 
 def list_planned_cases(plan: Plan) -> set[tuple[str, int, str]]:

@@ -7,7 +7,14 @@ from .comparison import (
     QueryConfig,
     RegionsConfig,
 )
-from .idle import explain_idle_setting, list_idle_settings, require_settings_are_read
+from .idle import (
+    explain_idle_setting,
+    explain_unread_setting,
+    list_idle_settings,
+    list_unread_settings,
+    require_settings_are_read,
+    warn_of_unread_settings,
+)
 from .mapping import DescriptorConfig, MapConfig, MergeConfig, SphereConfig
 from .pipeline import OF_WHOLE_MAPS, PipelineConfig, setting_fields, settings_table
 from .presets import WEIGHTS, WEIGHTS_FILES, Site, load_config, preset_files, preset_names
@@ -37,11 +44,14 @@ __all__ = [
     "SphereConfig",
     "SurfaceConfig",
     "explain_idle_setting",
+    "explain_unread_setting",
     "list_idle_settings",
+    "list_unread_settings",
     "load_config",
     "preset_files",
     "preset_names",
     "require_settings_are_read",
     "setting_fields",
     "settings_table",
+    "warn_of_unread_settings",
 ]

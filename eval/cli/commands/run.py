@@ -114,6 +114,7 @@ def run_command(
         raise InputError("--dry-run looks into the run folder alone: leave --rows-to out")
     if dry_run:
         _list_cells(chosen, out, force=force, limit=limit, shard=part)
+        _warn_of_unread_settings(chosen)
         return
     require_reachable(where)
     warn(exposure(where))
@@ -352,6 +353,13 @@ def _open_mirror(url: str, out: Path) -> Mirror:
     return Mirror(url)
 
 
+def _warn_of_unread_settings(plan: Plan) -> None:
+    from eval.plans.cells import explain_unread_settings
+
+    for text in explain_unread_settings(plan):
+        warn(text)
+
+
 def _run(plan: Plan, out: Path, where: Where, *, quiet: bool, wide: bool = False, **options: Any) -> None:
     from eval.plans.cells import expand_cells
     from eval.running.runfolder import held_run_folder
@@ -360,6 +368,7 @@ def _run(plan: Plan, out: Path, where: Where, *, quiet: bool, wide: bool = False
 
     # raises where settings contradict each other, or there are too many shards, before a folder is made
     choose_cells(expand_cells(plan), options.get("shard"))
+    _warn_of_unread_settings(plan)
     command = ["tunnelcd", *sys.argv[1:]]
     with held_run_folder(out) as run, shown_progress(quiet, rate="cells") as progress:
         outcome = run_plan(plan, run, command=command, where=where, progress=progress, **options)

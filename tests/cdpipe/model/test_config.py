@@ -2,12 +2,14 @@ from pathlib import Path
 
 import pytest
 
-from cdpipe.core.errors import InputError
+from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.yamlfile import setting_lines
 from cdpipe.model.config import (
     PipelineConfig,
     RegionsConfig,
+    Site,
     list_idle_settings,
+    list_unread_settings,
     load_config,
     preset_names,
     settings_table,
@@ -235,6 +237,42 @@ def test_a_setting_of_another_source_of_regions_is_not_read(setting: str) -> Non
         detect("before", "after", settings=[setting])
     own = load_config(section.replace("_", "-"), [setting])
     assert list_idle_settings(own, [setting]) == []
+
+
+@pytest.mark.parametrize(
+    ("preset", "setting", "ways"),
+    [
+        ("tunnelcd", "extract.voxel_m=0.3", "extract.method=voxel"),
+        ("tunnelcd", "extract.distance_m=0.2", "extract.method=nearest"),
+        ("tunnelcd", "cluster.min_points=8", "extract.method=voxel or extract.method=nearest"),
+        ("tunnelcd", "outlier.sigmas=3", "extract.method=voxel or extract.method=nearest"),
+        ("paper", "extract.min_cells=20", "extract.method=surface"),
+        ("paper", "extract.distance_m=0.2", "extract.method=nearest"),
+        ("m3c2", "cluster.min_points=8", "extract.method=voxel or extract.method=nearest"),
+    ],
+)
+def test_a_setting_of_another_extraction_is_warned_of(preset: str, setting: str, ways: str) -> None:
+    method = load_config(preset).extract.method
+    expected = f"{setting} changes nothing: extract.method = {method} does not read it; set {ways} as well"
+    with pytest.warns(InputWarning) as told, pytest.raises(InputError, match="no such"):
+        detect("gone-before", "gone-after", preset, [setting])
+    assert [str(each.message) for each in told] == [expected]
+    for way in ways.split(" or "):
+        assert list_unread_settings(load_config("tunnelcd", [way, setting]), [way, setting]) == []
+
+
+def test_filter_and_clusters_are_read_by_sources_that_compare_whole_maps() -> None:
+    assert load_config("m3c2").extract.method == "clusters"
+    for setting in ("cluster.radius_m=0.4", "outlier.neighbours=6", "outlier.sigmas=3"):
+        assert list_unread_settings(load_config("m3c2", [setting]), [setting]) == []
+
+
+@pytest.mark.parametrize("preset", preset_names())
+def test_no_preset_states_a_setting_that_its_extraction_does_not_read(preset: str) -> None:
+    sites: tuple[Site, ...] = ("narrow", "wide")
+    for site in sites:
+        config = load_config(preset, site=site)
+        assert list_unread_settings(config, setting_lines(config.model_dump())) == []
 
 
 def test_sections_that_two_methods_read_and_those_that_an_answer_states() -> None:

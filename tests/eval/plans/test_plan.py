@@ -7,7 +7,7 @@ from cdpipe.core.errors import InputError
 from cdpipe.core.names import path_part
 from cdpipe.model.config import load_config
 from eval.plans import plan as plan_module
-from eval.plans.cells import expand_cells, list_planned_cases
+from eval.plans.cells import expand_cells, explain_unread_settings, list_planned_cases
 from eval.plans.changes import change_plan
 from eval.plans.files import plan_names
 from eval.plans.parts import require_valid_setting
@@ -583,3 +583,21 @@ def test_a_setting_that_no_method_of_the_plan_reads_is_refused(tmp_path: Path) -
     # one set is for all variants: it is enough that one of them reads it
     shared = "set: [voxel_diff.voxel_m=0.3], variants: [{preset: tunnelcd}, {preset: voxel-diff}]}"
     assert len(expand_cells(read(tmp_path, start + shared))) == 2
+
+
+def test_a_setting_that_no_extraction_of_the_plan_reads_is_told(tmp_path: Path) -> None:
+    start = "{name: m, scenarios: [narrow], seeds: [7], "
+    grid = "grid: [{variant: tunnelcd, keys: {extract.voxel_m: [0.3, 0.65], extract.min_cells: [20]}}]}"
+    plan = read(tmp_path, start + "variants: [{preset: tunnelcd}, {preset: paper}], " + grid)
+    assert explain_unread_settings(plan) == [  # that of 0.65 is the default
+        "extract.voxel_m=0.3 changes nothing: extract.method = surface does not read it; set extract.method=voxel "
+        "as well"
+    ]
+    # one set is for all variants: it is enough that one of them reads it
+    shared = "set: [extract.voxel_m=0.3], variants: [{preset: tunnelcd}, {preset: paper}]}"
+    assert explain_unread_settings(read(tmp_path, start + shared)) == []
+
+
+@pytest.mark.parametrize("name", plan_names())
+def test_all_settings_of_a_shipped_plan_are_read(name: str) -> None:
+    assert explain_unread_settings(plan_of(name)) == []

@@ -79,7 +79,17 @@ def test_the_threshold_is_the_larger_one_of_those_by_either_kind_of_null_window(
     everything = np.concatenate([null, loud])
     assert find_threshold(null, loud, everything) == pytest.approx((0.038, 1 / 42))
     assert find_threshold(loud, null, everything) == pytest.approx((0.038, 1 / 42))
+    assert find_threshold(null, loud[1:], np.zeros(40))[0] == pytest.approx(0.0381)
     assert find_threshold(null, loud[2:], np.zeros(40))[0] == pytest.approx(0.019)  # 19 are too few
+
+
+def test_a_window_is_covered_from_one_half_on_and_found_beyond_rounding_in_one_bin() -> None:
+    half = [{**row, "cover": 0.5} for row in null_windows()]
+    edge_m, threshold_m = EDGES_M[1], 0.019
+    answers = (threshold_m + 2e-9, threshold_m + 0.5e-9, threshold_m, threshold_m - 0.5e-9)
+    (row,) = detection_limits(pd.DataFrame([*half, *(window(edge_m, each) for each in answers)]))
+    assert (row["threshold_m"], row["n_null_windows"]) == (pytest.approx(threshold_m), 21)
+    assert (row["from_m"], row["n_windows"], row["found_share"]) == (edge_m, 4, 0.25)
 
 
 def test_windows_of_checks_count_as_false_alarms_and_few_of_them_set_no_threshold() -> None:
@@ -128,6 +138,7 @@ def test_guesses_where_few_thresholds_come_from_do_not_pay(guessed_share: float)
         ([1.0, 1.0, 1.0], 0.01),
         ([0.0, 0.0, 0.4], NAN),
         ([0.0, 0.5, 1.0], 0.02),
+        ([0.0, 0.5], 0.02),
         ([0.0, 1.0, 1.0], np.sqrt(0.01 * 0.02)),
         ([1.0, 0.0, 1.0], np.sqrt(0.02 * 0.04)),  # found by chance below what is missed
         ([], NAN),
