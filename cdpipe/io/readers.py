@@ -43,7 +43,7 @@ def open_session(path: str | Path, how: HowToRead | None = None, report: Progres
             inside a single scan are raised when it is read.
     """
     path, how = Path(path), how or HowToRead()
-    name = how.format or guess_format(path)
+    name = guess_format(path, how.format)
     if name == "session":
         how.require_nothing(path, "a session has its own poses and sensor")
         return RecordedScans(read_session(path))

@@ -165,12 +165,25 @@ def open_inputs(paths: Sequence[Path], hows: Sequence[HowToRead], progress: RunP
     guess_formats(paths, hows)  # a long reading does not end at a wrong second name
     hows = share_topics(paths, hows)
     opened: list[Path | ScanSource] = []
-    for path, checked in zip(paths, _check_sessions(paths, hows), strict=True):
+    for path, how, checked in zip(paths, hows, _check_sessions(paths, hows), strict=True):
         source = path if checked is None else open_session(path, checked, progress.stage)
         opened.append(source)
         if getattr(source, "is_temporary", False):
-            progress.note(f"{path} was read into a temporary folder: `tunnelcd convert {path} FOLDER` keeps it")
+            command = " ".join(["tunnelcd", "convert", str(path), "FOLDER", *_options(how)])
+            progress.note(f"{path} was read into a temporary folder: `{command}` keeps it")
     return opened
+
+
+def _options(how: HowToRead) -> list[str]:
+    """Return the options that say how to read one recording."""
+    values = {"format": how.format, "trajectory": how.trajectory, "odometry": how.odometry, "metadata": how.metadata}
+    found = [f"--{name} {value}" for name, value in values.items() if value is not None]
+    found += [f"--topic {topic}" for topic in how.topics]
+    if not how.deskew:
+        found.append("--no-deskew")
+    if any(how.origin_m):
+        found.append(f"--origin {','.join(f'{value:g}' for value in how.origin_m)}")
+    return found
 
 
 def guess_formats(paths: Sequence[Path], hows: Sequence[HowToRead]) -> list[str]:
@@ -183,7 +196,7 @@ def guess_formats(paths: Sequence[Path], hows: Sequence[HowToRead]) -> list[str]
     from cdpipe.io.foreign import guess_format
     from cdpipe.io.foreign.sniff import OUSTER
 
-    names = [how.format or guess_format(path) for path, how in zip(paths, hows, strict=True)]
+    names = [guess_format(path, how.format) for path, how in zip(paths, hows, strict=True)]
     if "bag" not in names and any(how.topics for how in hows):
         raise InputError(f"--topic: {paths[0]} is no bag: leave it out")
     for path, how, name in zip(paths, hows, names, strict=True):

@@ -122,7 +122,7 @@ def _how(recording: Recording, number: int) -> HowToRead:
 
 def _open(path: Path, how: HowToRead, folder: Path, on_progress: Progress) -> Session:
     """Open a recording as a session; an OSF or PCAP is written into a folder first."""
-    name = how.format or guess_format(path)
+    name = guess_format(path, how.format)
     if name == "session":
         open_session(path, how)  # which refuses options that a session has no use for
         return read_session(path)

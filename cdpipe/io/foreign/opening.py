@@ -203,7 +203,7 @@ def _removed_on_error(folder: Path) -> Iterator[Path]:
 
 def _open_clouds(path: Path, how: HowToRead, report: Progress) -> Clouds:
     """Open what holds the scans; poses are not looked for where a person says where they come from."""
-    name = how.format or guess_format(path)
+    name = guess_format(path, how.format)
     is_posed = how.trajectory is not None or how.odometry is not None
     if name == "e57":
         return _open_e57(path, how, is_posed)

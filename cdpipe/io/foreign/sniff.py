@@ -59,27 +59,42 @@ _OF_AN_ANSWER = {"objects.ply", "surface.ply"}  # they are no scans
 _SCAN_FOLDERS = ("velodyne", "pcd", "scans", "clouds", "velodyne_points/data", "lidar", "points")
 
 
-def guess_format(path: Path) -> str:
+def guess_format(path: Path, said: str | None = None) -> str:
     """Return the name in `FORMATS` of what a file or folder holds.
 
+    Args:
+        path: A recording.
+        said: The format that somebody names, which is taken, unless a file begins as those of another one do.
+
     Raises:
-        InputError: It does not exist, or is none of them, or could be two.
+        InputError: It does not exist, or is none of them, or could be two; or it is not what it is said to be.
     """
+    if said is not None:
+        begins_as = [name for name in _begins_as(path) if name != said] if path.is_file() else []
+        if begins_as:
+            raise InputError(
+                f"{path}: --format {said}: begins as {FORMATS[begins_as[0]].about} does: leave --format out"
+            )
+        return said
     if path.is_dir():
         return _guess_folder(path)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder: expected a session, or a recording ({_known()})")
     if not path.is_file():
         raise InputError(f"{path}: a device or a pipe: expected a session, or a recording ({_known()})")
-    with path.open("rb") as file:
-        head = file.read(_N_MAGIC)
-    suffix = path.suffix.lower()
+    found, suffix = _begins_as(path), path.suffix.lower()
     # a damaged file is called what its name says
     named = [name for name, each in FORMATS.items() if suffix in each.suffixes]
-    found = [name for name, each in FORMATS.items() if any(head[at:].startswith(it) for at, it in each.magic)]
     if not (found or named):
         raise InputError(f"{path}: expected a session folder, or a recording ({_known()}); --format NAME overrides")
     return (found or named)[0]
+
+
+def _begins_as(path: Path) -> list[str]:
+    """Return the formats that begin as a file does."""
+    with path.open("rb") as file:
+        head = file.read(_N_MAGIC)
+    return [name for name, each in FORMATS.items() if any(head[at:].startswith(it) for at, it in each.magic)]
 
 
 def holds_scans(folder: Path) -> bool:

@@ -24,6 +24,8 @@ _THIN_M, _COLUMN_M = 0.2, 0.5
 _MOST_CELLS, _CELLS_A_POINT = 16_000_000, 8
 # A thinned point with no more others than this within that distance is no surface.
 _STRAY_M, _LEAST_AROUND = 0.6, 6
+# So the points of a surface lie at most so far apart.
+_LARGEST_SPACING_M = 0.4
 # A map that reaches no farther about its middle, which itself lies farther from the origin, has coordinates of a grid.
 _SITE_M = 50_000.0
 # Free height that a sensor needs, and its height in it.
@@ -63,9 +65,15 @@ class MapStations:
             way_out = _suggest_offset(points) or "are lengths metres? Else cut far points away"
             raise InputError(f"{path}: one cloud, a map without its scans, and {error}: {way_out}") from error
         if len(stations) == 0:
+            way_out = "z is up and lengths are metres? Else name a folder with one file per scan and a trajectory"
+            if (apart_m := _spacing_m(points)) > _LARGEST_SPACING_M:
+                way_out = (
+                    f"its points lie {apart_m:.2g} m apart, and a surface needs one every {_LARGEST_SPACING_M} m: name "
+                    "a denser map; if lengths are not metres, scale it"
+                )
             raise InputError(
-                f"{path}: one cloud, a map without its scans, and no floor with {_FREE_M} m of free height in it: z is "
-                "up and lengths are metres? Else name a folder with one file per scan and a trajectory"
+                f"{path}: one cloud, a map without its scans, and no floor with {_FREE_M} m of free height in it: "
+                f"{way_out}"
             )
         station = np.asarray(cKDTree(stations).query(points)[1], dtype=np.int64)
         used, station = np.unique(station, return_inverse=True)
@@ -104,6 +112,13 @@ def _suggest_offset(points: Float64Array) -> str:
         return ""
     offset = ",".join(f"{value:.0f}" for value in np.round(middle, -3) + 0.0)
     return f"coordinates of a map grid (UTM)? Subtract an origin from both maps: --origin {offset}"
+
+
+def _spacing_m(points: Float64Array) -> float:
+    """Return the median distance from a point to the next one, 0 without two points."""
+    if len(points) < 2:
+        return 0.0
+    return float(np.median(np.asarray(cKDTree(points).query(points[:10_000], k=[2])[0])))
 
 
 def find_stations(points: Float64Array) -> Float64Array:

@@ -27,6 +27,8 @@ _WAYS = {
     errno.EAGAIN: "wait until it ends, or name another",
     **dict.fromkeys(_FAILURES, "the disk, or the network to it, failed: start the command again once it works"),
 }
+# Two commands make worlds; the others have methods alone.
+_NO_WORLD = ("No such option: --world", "No such option: --world, which changes a world: a method is changed by --set")
 
 
 @contextmanager
@@ -78,6 +80,7 @@ def run_app(app: typer.Typer, name: str, words: Sequence[str], subcommands: Sequ
         command = " ".join([name, *(word for word in words[:1] if word in subcommands)])
         # typer alone would draw a box; "Value error" is pydantic's, and choices come one a line
         message = " ".join(error.format_message().replace("Value error, ", "").split()).rstrip(".")
+        message = message.replace(*_NO_WORLD)
         if message:  # there is none for `tunnelcd` alone, which has printed its help
             _tell(f"error: {command}: {visible(message)}: `{command} --help` lists its arguments")
         raise SystemExit(error.exit_code) from error

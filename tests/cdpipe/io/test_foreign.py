@@ -363,3 +363,16 @@ def test_a_real_las_of_another_program_reads_as_with_laspy(year: int) -> None:
     assert len(cloud.points) > 600
     np.testing.assert_array_equal(cloud.points, theirs.xyz)
     np.testing.assert_array_equal(cloud.intensity, theirs.intensity)
+
+
+def test_a_format_that_the_content_contradicts_is_refused(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "a.mcap", MADE)
+    for name in ("pcd", "las", "kitti", "osf"):
+        with pytest.raises(
+            InputError, match=rf"a\.mcap: --format {name}: begins as a ROS 1 bag, .* leave --format out$"
+        ):
+            guess_format(bag, name)
+    assert guess_format(bag, "bag") == "bag"
+    plain = tmp_path / "a.bin"
+    plain.write_bytes(bytes(64))
+    assert guess_format(plain, "las") == "las"  # nothing in it says otherwise

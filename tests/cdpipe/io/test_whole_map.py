@@ -127,6 +127,13 @@ def test_a_map_without_a_floor_is_refused(tmp_path: Path, points: Float64Array) 
         open_session(write(tmp_path / "map.ply", points))
 
 
+def test_a_map_of_few_points_is_refused_with_their_spacing(tmp_path: Path) -> None:
+    points = drift(1)
+    thin = points[stream(1, "thin").permutation(len(points))[: len(points) // 200]]
+    with pytest.raises(InputError, match=r"its points lie [0-9.]+ m apart, and a surface needs one every 0\.4 m"):
+        open_session(write(tmp_path / "map.ply", thin))
+
+
 def test_a_map_in_the_coordinates_of_a_country_is_refused_with_the_offset_to_subtract(tmp_path: Path) -> None:
     points = drift(1)[:2_000] + np.array([432_010.0, 5_411_020.0, 320.0])
     path = write(tmp_path / "utm.ply", points)

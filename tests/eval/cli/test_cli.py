@@ -400,6 +400,7 @@ def test_unknown_names(tmp_path: Path, command: Command) -> None:
             ["tunnelcd simulate: "],
         ),
         (["detect", "a", "b", "--site", "wid", "--out", "x"], ["'wid'"]),
+        (["detect", "a", "b", "--world", "query.radius_m=3", "--out", "x"], ["a method is changed by --set"]),
     ],
 )
 def test_usage_errors_are_one_line(

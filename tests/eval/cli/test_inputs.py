@@ -10,9 +10,10 @@ pytest.importorskip("pypcd4", reason="pip install 'tunnelcd[formats]'")
 pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
 
 from cdpipe.core.errors import InputError
-from cdpipe.io.foreign import share_topics
+from cdpipe.io.foreign import HowToRead, share_topics
 from cdpipe.io.readers import open_session
-from eval.cli.inputs import how_to_read, read_metres
+from eval.cli.inputs import how_to_read, open_inputs, read_metres
+from eval.core.terminal.progress import Silent
 from tests.cdpipe.io.foreign_files import drive, write_bag, write_pcds, write_trajectory
 from tests.eval.cli.test_converting import Command, refused
 
@@ -124,3 +125,21 @@ def test_an_origin_is_three_metres_within_what_poses_may_have(text: str) -> None
     assert read_metres("origin", "432010.5,-5.4e6,320") == (432010.5, -5.4e6, 320.0)
     with pytest.raises(InputError, match=rf"^--origin {text}: expected three numbers in metres"):
         read_metres("origin", text)
+
+
+def test_the_command_that_keeps_a_recording_has_the_options_of_its_reading(tmp_path: Path) -> None:
+    made = drive()
+    bag = write_bag(tmp_path / "a.mcap", made)
+    how = HowToRead(
+        trajectory=write_trajectory(tmp_path / "t.tum", made.stamps_s), topics=("/ouster/points",), deskew=False
+    )
+
+    told: list[str] = []
+
+    class Notes(Silent):
+        def note(self, text: str) -> None:
+            told.append(text)
+
+    open_inputs([bag], [how], Notes())
+    command = f"tunnelcd convert {bag} FOLDER --trajectory {tmp_path / 't.tum'} --topic /ouster/points --no-deskew"
+    assert told == [f"{bag} was read into a temporary folder: `{command}` keeps it"]
