@@ -104,7 +104,8 @@ def test_a_plan_in_a_folder_is_a_plan(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setenv("TUNNELCD_PATH", str(write_blocks("eval/plans/HOWTO.md", tmp_path)))
     assert "thick-voxels" in plan_names()
     variants = {cell.variant for cell in expand_cells(load_plan("thick-voxels"))}
-    assert {"tunnelcd", "voxel-diff[extract.voxel_m=0.2]", "voxel-diff[extract.voxel_m=0.5]"} <= variants
+    grid = {f"voxel-diff[extract.method=voxel,extract.voxel_m={voxel_m}]" for voxel_m in (0.2, 0.5)}
+    assert {"tunnelcd", *grid} <= variants
     assert check_file("thick-voxels").startswith("a plan of ")
 
 
