@@ -101,7 +101,7 @@ def choose_format(out: Path, name: str | None) -> str:
     if found is None:
         known = ", ".join(suffix for each in FORMATS.values() for suffix in each.suffixes)
         raise InputError(
-            f"{out}: expected a new file that ends in {known}, or a new folder of PCD files; --to NAME overrides "
-            f"({', '.join(FORMATS)})"
+            f"{out}: expected a new file that ends in {known}, or a new folder without a dot in its name; --to "
+            f"NAME overrides ({', '.join(FORMATS)})"
         )
     return found
