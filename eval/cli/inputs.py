@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -169,7 +170,7 @@ def open_inputs(paths: Sequence[Path], hows: Sequence[HowToRead], progress: RunP
         source = path if checked is None else open_session(path, checked, progress.stage)
         opened.append(source)
         if getattr(source, "is_temporary", False):
-            command = " ".join(["tunnelcd", "convert", str(path), "FOLDER", *_options(how)])
+            command = shlex.join(["tunnelcd", "convert", str(path), "FOLDER", *_options(how)])
             progress.note(f"{path} was read into a temporary folder: `{command}` keeps it")
     return opened
 
@@ -177,12 +178,12 @@ def open_inputs(paths: Sequence[Path], hows: Sequence[HowToRead], progress: RunP
 def _options(how: HowToRead) -> list[str]:
     """Return the options that say how to read one recording."""
     values = {"format": how.format, "trajectory": how.trajectory, "odometry": how.odometry, "metadata": how.metadata}
-    found = [f"--{name} {value}" for name, value in values.items() if value is not None]
-    found += [f"--topic {topic}" for topic in how.topics]
+    found = [word for name, value in values.items() if value is not None for word in (f"--{name}", str(value))]
+    found += [word for topic in how.topics for word in ("--topic", topic)]
     if not how.deskew:
         found.append("--no-deskew")
     if any(how.origin_m):
-        found.append(f"--origin {','.join(f'{value:g}' for value in how.origin_m)}")
+        found += ["--origin", ",".join(str(value) for value in how.origin_m)]
     return found
 
 

@@ -21,7 +21,7 @@ def share_topics(paths: Sequence[Path], hows: Sequence[HowToRead]) -> list[HowTo
         InputError: A bag cannot be read.
     """
     told = list(zip(paths, hows, strict=True))
-    bags = {path for path, how in told if how.topics and (guess_format(path, how.format)) == "bag"}
+    bags = {path for path, how in told if how.topics and guess_format(path, how.format) == "bag"}
     if len(bags) < 2:
         return list(hows)
     held = {path: _list_topics(path) for path in bags}

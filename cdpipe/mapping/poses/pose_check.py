@@ -34,8 +34,7 @@ def check_poses(source: ScanSource, where: str) -> None:
         where: The trajectory, for the message.
 
     Raises:
-        InputError: The scans fit much better in another way.
-        InputWarning: They fit much better unmoved, and no way explains it.
+        InputError: The scans fit much better in another way. An `InputWarning`: unmoved, and no way explains it.
     """
     poses = source.odom_T_sensor
     pairs = _turned_pairs(poses)
@@ -49,8 +48,8 @@ def check_poses(source: ScanSource, where: str) -> None:
         turned = [_misfit_m(fixed, moving, _turn_about(moving, degrees)) for degrees in (0.0, *_TURNS_DEG)]
         found.append([*moved, turned[0], min(turned[1:])])
     given_m, swapped_m, inverted_m, unmoved_m, turned_m = np.median(np.array(found), axis=0)
-    best_m = min(swapped_m, inverted_m, unmoved_m)
-    if best_m >= _FITS_M or given_m <= _TIMES_BETTER * best_m:
+    fits_m = min(_FITS_M, given_m / _TIMES_BETTER)
+    if min(swapped_m, inverted_m, unmoved_m) >= fits_m:
         return
     apart = f"{where}: the scans lie {given_m:.2f} m apart with "
     if unmoved_m <= min(swapped_m, inverted_m) and unmoved_m < turned_m:
@@ -58,12 +57,12 @@ def check_poses(source: ScanSource, where: str) -> None:
             f"{apart}these poses, {unmoved_m:.2f} m as they are: they look registered already, in the frame of the "
             "poses: give them in the frame of the sensor; or are the angles or lengths of the poses in another unit?"
         )
-    if given_m > _TIMES_BETTER * swapped_m and swapped_m <= inverted_m:
+    if swapped_m < fits_m and swapped_m <= inverted_m:
         raise InputError(
             f"{apart}its quaternions as qx qy qz qw, {swapped_m:.2f} m as qw qx qy qz: they look like qw first: move "
             "that column to the end"
         )
-    if given_m > _TIMES_BETTER * inverted_m:
+    if inverted_m < fits_m:
         raise InputError(
             f"{apart}these poses, {inverted_m:.2f} m with the inverse ones: give those of the sensor in the frame of "
             "the map, and not of the map in the frame of the sensor"
