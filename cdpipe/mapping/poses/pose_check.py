@@ -44,8 +44,9 @@ def check_poses(source: ScanSource, where: str) -> None:
     found = []
     for one, other in pairs:
         fixed, moving = source.scan(one).points_sensor, source.scan(other).points_sensor
-        moved = [_misfit_m(fixed, moving, invert(each[one]) @ each[other]) for each in ways]
-        turned = [_misfit_m(fixed, moving, _turn_about(moving, degrees)) for degrees in (0.0, *_TURNS_DEG)]
+        tree = cKDTree(fixed[:: max(1, len(fixed) // _N_POINTS)])
+        moved = [_misfit_m(tree, moving, invert(each[one]) @ each[other]) for each in ways]
+        turned = [_misfit_m(tree, moving, _turn_about(moving, degrees)) for degrees in (0.0, *_TURNS_DEG)]
         found.append([*moved, turned[0], min(turned[1:])])
     given_m, swapped_m, inverted_m, unmoved_m, turned_m = np.median(np.array(found), axis=0)
     fits_m = min(_FITS_M, given_m / _TIMES_BETTER)
@@ -100,8 +101,7 @@ def _turn_about(points: Float64Array, degrees: float) -> Float64Array:
     return make_pose(turn, middle - turn @ middle)
 
 
-def _misfit_m(fixed: Float64Array, moving: Float64Array, fixed_T_moving: Float64Array) -> float:
+def _misfit_m(fixed: cKDTree, moving: Float64Array, fixed_T_moving: Float64Array) -> float:
     """Return the median distance of the moved points to the nearest fixed one, metres."""
-    tree = cKDTree(fixed[:: max(1, len(fixed) // _N_POINTS)])
     placed = transform(fixed_T_moving, moving[:: max(1, len(moving) // _N_QUERIES)])
-    return float(np.median(tree.query(placed)[0]))
+    return float(np.median(fixed.query(placed)[0]))
