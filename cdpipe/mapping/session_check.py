@@ -58,9 +58,24 @@ def check_session(source: ScanSource, config: MapConfig, other: ScanSource | Non
     if len(points) == 0:
         raise InputError(f"{source.name}: none of the scans that were looked at holds a return")
     ranges_m = np.linalg.norm(points, axis=1)
-    _require_metres(source, ranges_m, other)
+    _require_ranges_in_metres(source, ranges_m, other)
+    _require_path_in_metres(source, ranges_m, source.name)
     if not getattr(source, "is_whole_map", False):  # stations cast no beams
         _require_up(source, points[ranges_m > 0] / ranges_m[ranges_m > 0, None], config.keyframe_spacing_m)
+
+
+def require_path_in_metres(source: ScanSource, where: str) -> None:
+    """Refuse a trajectory that cannot be in metres; five scans are read.
+
+    Args:
+        source: The scans with their poses.
+        where: The recording or the trajectory, for the message.
+
+    Raises:
+        InputError: Neighbouring scans lie too far apart for any robot; the unit that explains it is named.
+    """
+    if len(points := _sampled_points(source)):
+        _require_path_in_metres(source, np.linalg.norm(points, axis=1), where)
 
 
 def is_same_session(before: ScanSource, after: ScanSource) -> bool:
@@ -107,7 +122,7 @@ def _sampled_points(source: ScanSource) -> Float64Array:
     return np.concatenate([source.scan(index).points_sensor for index in _sampled(len(source.odom_T_sensor))])
 
 
-def _require_metres(source: ScanSource, ranges_m: Float64Array, other: ScanSource | None) -> None:
+def _require_ranges_in_metres(source: ScanSource, ranges_m: Float64Array, other: ScanSource | None) -> None:
     median_m = float(np.median(ranges_m))
     if not _NEAREST_M <= median_m <= _FARTHEST_M:
         usual_m = _USUAL_M
@@ -120,12 +135,15 @@ def _require_metres(source: ScanSource, ranges_m: Float64Array, other: ScanSourc
             f"{source.name}: half of the returns lie {side} {median_m:.4g} m: expected metres; "
             f"{_likely('the points', median_m, usual_m)}, and the trajectory too where it is in the same unit"
         )
+
+
+def _require_path_in_metres(source: ScanSource, ranges_m: Float64Array, where: str) -> None:
     steps_m = np.linalg.norm(np.diff(source.odom_T_sensor[:, :3, 3], axis=0), axis=1)
     step_m = float(np.median(steps_m)) if len(steps_m) else 0.0
     reach_m = float(np.quantile(ranges_m, 0.95))
     if step_m > reach_m and _speed_m_per_s(source) > _FASTEST_M_PER_S:
         raise InputError(
-            f"{source.name}: neighbouring scans lie {step_m:.4g} m apart and see {reach_m:.3g} m far: expected a "
+            f"{where}: neighbouring scans lie {step_m:.4g} m apart and see {reach_m:.3g} m far: expected a "
             f"trajectory in metres; {_likely('the trajectory', step_m, _USUAL_STEP_M)}"
         )
 

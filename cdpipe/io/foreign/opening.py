@@ -32,6 +32,7 @@ from cdpipe.io.session import is_session
 from cdpipe.io.tum import write_tum
 from cdpipe.mapping.poses.odometry import ODOMETRIES, estimate_cloud_motion
 from cdpipe.mapping.poses.pose_check import check_poses
+from cdpipe.mapping.session_check import require_path_in_metres
 from cdpipe.model.types import PosedScan
 
 KISS_ICP = "kiss-icp"
@@ -153,6 +154,7 @@ def convert_recording(path: Path, out: Path, how: HowToRead, report: Progress) -
         _write_stream(source, out, how, report)
     else:
         if how.odometry is None:
+            require_path_in_metres(source, source.poses_from)
             check_poses(source, source.poses_from)
         write_scans(source, out, report)
     return len(source.odom_T_sensor), source.poses_from
@@ -163,6 +165,8 @@ def _write_stream(source: _Posed, folder: Path, how: HowToRead, report: Progress
     write_scans(source, folder, report)
     clouds = open_folder(folder, "ply", has_poses=True)
     opened = PosedClouds(clouds, source.odom_T_sensor, source.stamps_s, None)
+    if how.odometry is None:
+        require_path_in_metres(opened, source.poses_from)
     if how.trajectory is not None:
         check_poses(opened, source.poses_from)
     return opened

@@ -33,6 +33,7 @@ from cdpipe.io.session import ScanChunk, Session, SessionWriter, fit_chunk
 from cdpipe.io.tum import motion_along
 from cdpipe.mapping.poses.odometry import ODOMETRIES, Image, estimate_motion
 from cdpipe.mapping.poses.pose_check import check_poses
+from cdpipe.mapping.session_check import require_path_in_metres
 from cdpipe.model.types import PosedScan, WrappedScans
 
 KISS_ICP = "kiss-icp"
@@ -124,7 +125,9 @@ def import_recording(
             written = Session(
                 writer.folder, recording.sensor, odom_T_sensor, chunk_scans, provenance, n_returns=times.n_returns
             )
-            check_poses(_ScansWithReturns(written, times.has_returns), str(trajectory))
+            scans = _ScansWithReturns(written, times.has_returns)
+            require_path_in_metres(scans, str(trajectory))
+            check_poses(scans, str(trajectory))
         writer.close(odom_T_sensor)
     sensor = f"{recording.sensor.product}, {recording.sensor.mode}"
     return Imported(len(times.first_ns), poses, sensor, times.n_left_out)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -93,6 +94,20 @@ def test_quaternions_with_w_first_are_noticed_where_a_bag_is_converted(tmp_path:
         path = write_trajectory(tmp_path / f"{order}.tum", dense.stamps_s, order=order)
         with nullcontext() if is_right else pytest.raises(InputError, match="they look like qw first"):
             convert_recording(bag, tmp_path / order, HowToRead(trajectory=path), lambda *_: None)
+
+
+@pytest.mark.parametrize("write", [write_bag, write_pcds])
+def test_a_trajectory_in_millimetres_is_noticed_where_a_recording_is_converted(
+    write: Callable[..., Path], tmp_path: Path
+) -> None:
+    recording = write(tmp_path / ("a.mcap" if write is write_bag else "run"), MADE)
+    if recording.is_dir():
+        np.savetxt(recording / "times.txt", START_NS / 1e9 + MADE.stamps_s, fmt="%.6f")
+    rows = np.loadtxt(write_trajectory(tmp_path / "t.tum", FINE_S))
+    rows[:, 1:4] *= 1000.0
+    np.savetxt(tmp_path / "mm.tum", rows, fmt="%.9f")
+    with pytest.raises(InputError, match=r"mm\.tum: neighbouring scans lie .* the trajectory looks like millimetres"):
+        convert_recording(recording, tmp_path / "out", HowToRead(trajectory=tmp_path / "mm.tum"), lambda *_: None)
 
 
 def test_a_file_that_begins_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:

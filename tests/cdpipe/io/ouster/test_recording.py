@@ -210,6 +210,21 @@ def test_quaternions_with_w_first_are_refused_and_nothing_stays(tmp_path: Path) 
     assert import_recording(path, tmp_path / "s", trajectory=tmp_path / "right.tum").n_scans == 8
 
 
+def test_a_trajectory_in_millimetres_is_refused(tmp_path: Path) -> None:
+    info = info_of(SENSOR)
+    made = frames(info, 8, lambda _: np.eye(4))
+    in_a_room(made, lambda time_s: make_pose(np.eye(3), np.array([time_s, 0.0, 0.0])))
+    path = write_frames(tmp_path / "r.osf", info, made)
+    time_s = np.arange(-0.05, 0.9, 0.01)
+    turns = np.tile([0.0, 0.0, 0.0, 1.0], (len(time_s), 1))
+    places_mm = np.outer(1000.0 * time_s, [1.0, 0.0, 0.0])
+    np.savetxt(tmp_path / "mm.tum", np.column_stack([START_NS / 1e9 + time_s, places_mm, turns]), fmt="%.9f")
+    told = said(lambda: import_recording(path, tmp_path / "s", trajectory=tmp_path / "mm.tum"))
+    assert told.startswith(f"{tmp_path / 'mm.tum'}: neighbouring scans lie ")
+    assert "the trajectory looks like millimetres" in told
+    assert left(tmp_path) == ["mm.tum", "r.osf"]
+
+
 def test_a_pose_per_revolution_at_its_first_column_is_enough(tmp_path: Path) -> None:
     info = info_of(SENSOR)
     path = write_frames(tmp_path / "r.osf", info, frames(info, 3))
