@@ -30,6 +30,7 @@ for every one of them is mixed: its `change` is -1, and it counts for nothing. S
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from functools import cache
@@ -245,7 +246,21 @@ def read_pair_truth(pair: str | Path) -> PairTruth:
     for index, rock in enumerate(truth.surface_changes):
         if any(abs(value) > FARTHEST_M for value in rock.centre_world):
             raise InputError(f"{path}: damaged: surface_changes.{index}: farther than {FARTHEST_M:g} m from the origin")
+    _require_halves(path, truth)
     return truth
+
+
+def _require_halves(path: Path, truth: PairTruth) -> None:
+    """Refuse ids that stand twice, and halves of a move that do not name each other."""
+    for name, entries in (("changes", truth.changes), ("surface_changes", truth.surface_changes)):
+        most = Counter(each.id for each in entries).most_common(1)
+        if most and most[0][1] > 1:
+            raise InputError(f"{path}: damaged: {name}: id {most[0][0]} stands there {most[0][1]} times")
+    by_id = {change.id: change for change in truth.changes}
+    for change in truth.changes:
+        other = by_id.get(change.partner) if change.kind == "moved" and change.partner is not None else None
+        if other is not None and (other.partner != change.id or other.session == change.session):
+            raise InputError(f"{path}: damaged: changes {change.id} and {other.id} are not the halves of one move")
 
 
 @cache

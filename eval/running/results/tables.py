@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -60,8 +61,9 @@ def _require_values(path: Path, frame: pd.DataFrame) -> None:
 
 
 def require_numbers(path: Path, frame: pd.DataFrame, texts: Collection[str]) -> None:
-    """Refuse text in a column that is not of `texts`, and a list of ids that is none."""
+    """Refuse text in a column that is not of `texts`, a list of ids that is none, and a number for a truth value."""
     for name in frame:
+        _require_truth_values(path, frame[name])
         if pd.api.types.is_numeric_dtype(frame[name]) or (name in texts and name not in _ID_LISTS):
             continue
         are_ids = name in _ID_LISTS
@@ -73,6 +75,15 @@ def require_numbers(path: Path, frame: pd.DataFrame, texts: Collection[str]) -> 
         if wrong:  # one text makes all numbers of its column texts
             line, value = next((each for each in wrong if not _NUMBER.fullmatch(str(each[1]))), wrong[0])
             raise InputError(f"{path}:{line}: {name} = {value!r:.40}: expected a number")
+
+
+def _require_truth_values(path: Path, column: pd.Series[Any]) -> None:
+    if not (str(column.name).startswith("is_") and pd.api.types.is_numeric_dtype(column)):
+        return
+    is_none = ~(column.isna() | column.isin([0, 1])).to_numpy(dtype=bool)
+    if is_none.any():
+        line = int(np.argmax(is_none))
+        raise InputError(f"{path}:{line + 2}: {column.name} = {column.iloc[line]}: expected True or False")
 
 
 def without_unusable(frame: pd.DataFrame) -> pd.DataFrame:

@@ -132,6 +132,7 @@ def test_times_of_a_trajectory_and_of_its_scans_agree(tmp_path: Path) -> None:
     [
         ("1 2 3\n", "3 fields: expected eight numbers"),
         ("a,b,c\n1,2,3\n", "its header names a, b, c"),
+        ("a,b\x0cc,d\n1,2,3\n", r"its header names a, b\x0cc, d: expected"),
         ("x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,2\n", "the quaternion's length is 2"),
         ("1 0 0 0 0 1 0 0 0 0 2 0\n", "t.txt:1: the first three columns of its 3x4 matrix are no rotation"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0\n", "t.txt:2: 3 fields, 12 in the first line"),

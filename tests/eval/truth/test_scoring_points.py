@@ -179,6 +179,27 @@ def test_truth_that_is_too_far_away_is_one_line(tiny_pair: Path) -> None:
         load_ground_truth(tiny_pair)
 
 
+@pytest.mark.parametrize(
+    ("at", "wrong", "expected"),
+    [
+        (0, {"id": 2}, "changes: id 2 stands there 2 times"),
+        (0, {"kind": "moved", "partner": 2}, "changes 1 and 2 are not the halves of one move"),
+        (1, {"session": "after"}, "changes 2 and 3 are not the halves of one move"),
+        (2, {"partner": 1}, "changes 2 and 3 are not the halves of one move"),
+    ],
+)
+def test_changes_that_contradict_each_other_are_one_line(
+    tiny_pair: Path, at: int, wrong: dict[str, object], expected: str
+) -> None:
+    path = tiny_pair / "truth" / "changes.json"
+    document = json.loads(path.read_text())
+    assert [each["partner"] for each in document["changes"]] == [None, 3, 2]
+    document["changes"][at] |= wrong
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError, match=rf"changes\.json: damaged: {expected}"):
+        load_ground_truth(tiny_pair)
+
+
 def test_labels_of_another_session_are_refused(tiny_pair: Path) -> None:
     session = tiny_pair / "before"
     write_labels(session, 1, np.zeros((5, 4, 32), np.int16), np.zeros((5, 4, 32), np.int16))

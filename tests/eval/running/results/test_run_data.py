@@ -67,6 +67,20 @@ def test_what_a_run_wrote_comes_before_a_compressed_copy(tmp_path: Path) -> None
     assert [row["region_recall"] for row in read_run(run).results] == [0.25]
 
 
+@pytest.mark.parametrize(("table", "column"), [("results", "is_unchanged_pair"), ("changes", "is_observable")])
+def test_a_number_in_the_place_of_a_truth_value_is_named(tmp_path: Path, table: str, column: str) -> None:
+    run = written(tmp_path / "run", ".csv")
+    for right in (1, 0.0, "", True):
+        pd.DataFrame([{**row, column: right} for row in TABLES[table]]).to_csv(run / f"{table}.csv", index=False)
+        read_run(run)
+    pd.DataFrame([*TABLES[table], {**TABLES[table][0], "seed": 3, column: -0.1}]).assign(
+        **{column: lambda frame: frame[column].astype(float)}
+    ).to_csv(run / f"{table}.csv", index=False)
+    line = len(TABLES[table]) + 2
+    with pytest.raises(InputError, match=rf"{table}\.csv:{line}: {column} = -0\.1: expected True or False"):
+        read_run(run)
+
+
 @pytest.mark.parametrize("content", [b"no such format", b""])
 def test_a_damaged_copy_is_named(tmp_path: Path, content: bytes) -> None:
     run = written(tmp_path / "run", ".csv.xz")
