@@ -15,9 +15,11 @@ import argparse
 import ast
 import difflib
 import json
+import os
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +32,7 @@ ROOT = Path(__file__).parents[1]
 LIST = Path(__file__).with_suffix(".yaml")
 MADE = ROOT / "mutants"
 LEAST_DEAD = 0.92
+_KILLERS = Path("killers")
 # exit codes of mutmut: 0 all tests passed, 33 no test runs the function, null not run
 _SURVIVED, _UNTESTED, _NOT_RUN = 0, 33, None
 
@@ -130,8 +133,42 @@ def report_results(
 
 
 def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
-    """Run the tests that need the least first, each file from its start: a mutant is dead with the first failure."""
-    items.sort(key=lambda item: (len(item.fixturenames), item.location))
+    """Order the tests of a mutant, which is dead with the first failure.
+
+    First those that share no fixture of ours, as simulated pairs, which every mutant makes anew; among them and the
+    rest those that killed other mutants of the function, then of its module, then those that need the least, each file
+    from its start. mutmut runs this in `mutants`, each mutant in a process of its own.
+    """
+    module, function = _mutated()
+    kills: dict[str, Counter[str]] = {"": Counter(), function: Counter()}
+    if (killers := _KILLERS / module).is_file():
+        for line in killers.read_text().splitlines():
+            killed, test = line.split("\t", 1)
+            kills[function if killed == function else ""][test] += 1
+
+    def order(item: pytest.Function) -> tuple[Any, ...]:
+        fixtures = [each[-1] for each in item._fixtureinfo.name2fixturedefs.values()]
+        is_slow = any(each.baseid and each.scope != "function" for each in fixtures)
+        name = item.nodeid
+        return is_slow, -kills[function][name], -kills[""][name], len(item.fixturenames), item.location
+
+    items.sort(key=order)
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Remember the test that killed a mutant."""
+    module, function = _mutated()
+    if report.failed and function:
+        _KILLERS.mkdir(exist_ok=True)
+        with (_KILLERS / module).open("a") as file:
+            file.write(f"{function}\t{report.nodeid}\n")
+
+
+def _mutated() -> tuple[str, str]:
+    """Return the module and the function of the mutant that is tested; without one both are empty."""
+    name, is_one, _ = os.environ.get("MUTANT_UNDER_TEST", "").rpartition("__mutmut_")
+    module, _, function = name.rpartition(".")
+    return (module, function) if is_one else ("", "")
 
 
 def main() -> int:
