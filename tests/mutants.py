@@ -32,7 +32,8 @@ ROOT = Path(__file__).parents[1]
 LIST = Path(__file__).with_suffix(".yaml")
 MADE = ROOT / "mutants"
 LEAST_DEAD = 0.92
-_KILLERS = Path("killers")
+_KILLERS, _STATS = Path("killers"), Path("mutmut-stats.json")
+_SLOW_S = 0.5
 # exit codes of mutmut: 0 all tests passed, 33 no test runs the function, null not run
 _SURVIVED, _UNTESTED, _NOT_RUN = 0, 33, None
 
@@ -135,9 +136,10 @@ def report_results(
 def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
     """Order the tests of a mutant, which is dead with the first failure.
 
-    First those that share no fixture of ours, as simulated pairs, which every mutant makes anew; among them and the
-    rest those that killed other mutants of the function, then of its module, then those that need the least, each file
-    from its start. mutmut runs this in `mutants`, each mutant in a process of its own.
+    First those that take less than half a second and share no fixture of their file, as a simulated pair, which every
+    mutant makes anew; among them and the rest those that killed other mutants of the function, then of its module, then
+    those that need the least, each file from its start. mutmut runs this in `mutants`, each mutant in a process of its
+    own.
     """
     module, function = _mutated()
     kills: dict[str, Counter[str]] = {"": Counter(), function: Counter()}
@@ -146,10 +148,12 @@ def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
             killed, test = line.split("\t", 1)
             kills[function if killed == function else ""][test] += 1
 
+    lasted_s = json.loads(_STATS.read_text())["duration_by_test"] if _STATS.is_file() else {}
+
     def order(item: pytest.Function) -> tuple[Any, ...]:
-        fixtures = [each[-1] for each in item._fixtureinfo.name2fixturedefs.values()]
-        is_slow = any(each.baseid and each.scope != "function" for each in fixtures)
-        name = item.nodeid
+        name, fixtures = item.nodeid, [each[-1] for each in item._fixtureinfo.name2fixturedefs.values()]
+        is_slow = any(each.baseid.endswith(".py") and each.scope != "function" for each in fixtures)
+        is_slow |= lasted_s.get(name, 0.0) > _SLOW_S
         return is_slow, -kills[function][name], -kills[""][name], len(item.fixturenames), item.location
 
     items.sort(key=order)

@@ -102,26 +102,34 @@ def test_the_files_whose_mutants_are_made_exist() -> None:
     assert all(list(ROOT.glob(name)) for name in named)
 
 
-def test_what_killed_a_mutant_goes_first_but_for_what_shares_a_fixture(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_killed_a_mutant_goes_first_but_for_what_is_slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def item(name: str, n_fixtures: int, scope: str = "function") -> Any:
-        info = SimpleNamespace(name2fixturedefs={"pair": [SimpleNamespace(baseid="tests", scope=scope)]})
+        info = SimpleNamespace(name2fixturedefs={"pair": [SimpleNamespace(baseid="tests/test_a.py", scope=scope)]})
         return SimpleNamespace(nodeid=name, fixturenames=["tmp_path"] * n_fixtures, location=name, _fixtureinfo=info)
 
     monkeypatch.chdir(tmp_path)
     for function, name in (("x_f", "kills"), ("x_f", "shares"), ("x_g", "kills another"), ("x_g", "kills another")):
         monkeypatch.setenv("MUTANT_UNDER_TEST", f"a.b.{function}__mutmut_2")
         mutants.pytest_runtest_logreport(SimpleNamespace(failed=True, nodeid=name))  # type: ignore[arg-type]
+    Path("mutmut-stats.json").write_text('{"duration_by_test": {"shares too": 0.1, "takes long": 0.6}}')
     items = [
-        item("shares", 0, "session"), item("shares too", 0, "module"), item("needs more", 2), item("kills", 3),
-        item("kills another", 3), item("needs less", 1),
+        item("takes long", 0), item("shares", 0, "session"), item("shares too", 0, "module"), item("needs more", 2),
+        item("kills", 3), item("kills another", 3), item("needs less", 1),
     ]  # fmt: skip
     for mutated, expected in (
-        ("a.b.x_f__mutmut_1", ["kills", "kills another", "needs less", "needs more", "shares", "shares too"]),
-        ("a.b.x_g__mutmut_1", ["kills another", "kills", "needs less", "needs more", "shares", "shares too"]),
-        ("c.x_f__mutmut_1", ["needs less", "needs more", "kills", "kills another", "shares", "shares too"]),
-        ("stats", ["needs less", "needs more", "kills", "kills another", "shares", "shares too"]),
+        (
+            "a.b.x_f__mutmut_1",
+            ["kills", "kills another", "needs less", "needs more", "shares", "shares too", "takes long"],
+        ),
+        (
+            "a.b.x_g__mutmut_1",
+            ["kills another", "kills", "needs less", "needs more", "shares", "shares too", "takes long"],
+        ),
+        (
+            "c.x_f__mutmut_1",
+            ["needs less", "needs more", "kills", "kills another", "shares", "shares too", "takes long"],
+        ),
+        ("stats", ["needs less", "needs more", "kills", "kills another", "shares", "shares too", "takes long"]),
     ):
         monkeypatch.setenv("MUTANT_UNDER_TEST", mutated)
         mutants.pytest_collection_modifyitems(items)
