@@ -183,7 +183,10 @@ def read_las(path: str) -> Iterator[Message]:
 
 
 def read_e57_heads(path: str) -> Iterator[Message]:
-    """Yield number of points and pose (translation, then quaternion w, x, y, z) of each scan of an E57 file."""
+    """Yield number of points and pose (translation, then quaternion w, x, y, z) of each scan of an E57 file.
+
+    The pose is None where the scan has none, or a number of it is missing.
+    """
     import pye57
 
     with _reads(path, "an E57 file"):
@@ -192,7 +195,7 @@ def read_e57_heads(path: str) -> Iterator[Message]:
         for index in range(file.scan_count):
             head = file.get_header(index)
             pose = [*map(float, head.translation), *map(float, head.rotation)] if head.has_pose() else None
-            heads.append({"points": int(head.point_count), "pose": pose})
+            heads.append({"points": int(head.point_count), "pose": pose if pose and len(pose) == 7 else None})
     for head in heads:
         yield head, {}
 

@@ -88,8 +88,9 @@ def _require_truth_values(path: Path, column: pd.Series[Any]) -> None:
 
 def without_unusable(frame: pd.DataFrame) -> pd.DataFrame:
     """Return a table with NaN for figures that no mean, axis or cell can hold."""
-    names = _figures(frame)
-    return frame.assign(**{name: frame[name].mask(frame[name].abs() > LARGEST) for name in names})
+    names, usable = _figures(frame), frame.copy()
+    usable[names] = frame[names].mask(frame[names].abs() > LARGEST)
+    return usable
 
 
 def _figures(frame: pd.DataFrame) -> list[str]:

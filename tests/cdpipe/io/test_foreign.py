@@ -18,7 +18,7 @@ pytest.importorskip("rosbags", reason="pip install 'tunnelcd[formats]'")
 from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.io.foreign import HowToRead, convert_recording, folder_of_options, guess_format
 from cdpipe.io.foreign.clouds import point_times, stamps_of_names
-from cdpipe.io.foreign.points_files import cloud_reader, read_e57
+from cdpipe.io.foreign.points_files import cloud_reader, read_e57, read_e57_heads
 from cdpipe.io.foreign.sniff import find_scans
 from cdpipe.io.out.kitti import write_kitti as write_kitti_out
 from cdpipe.io.out.scans import Outgoing
@@ -122,6 +122,14 @@ def test_an_e57_without_a_coordinate_is_refused(tmp_path: Path, monkeypatch: pyt
 def test_e57_has_the_poses_of_its_scanner(tmp_path: Path) -> None:
     pytest.importorskip("pye57")
     assert worst_m(write_e57(tmp_path / "a.e57", STANDING)) < 1e-4
+
+
+def test_a_pose_of_an_e57_that_lacks_a_number_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scan_header = pytest.importorskip("pye57.scan_header")
+    file = write_e57(tmp_path / "a.e57", STANDING)
+    assert all(head["pose"] is not None for head, _ in read_e57_heads(str(file)))
+    monkeypatch.setattr(scan_header.ScanHeader, "translation", property(lambda _: np.zeros(2)))
+    assert all(head["pose"] is None for head, _ in read_e57_heads(str(file)))
 
 
 def test_a_folder_of_e57_stations_has_the_poses_of_its_scanners(tmp_path: Path) -> None:

@@ -81,6 +81,16 @@ def test_a_number_in_the_place_of_a_truth_value_is_named(tmp_path: Path, table: 
         read_run(run)
 
 
+def test_a_column_may_have_any_name(tmp_path: Path) -> None:
+    run = written(tmp_path / "run", ".csv")
+    pd.DataFrame([{**row, "self": 1e300, "frame": 0.5} for row in TABLES["results"]]).to_csv(
+        run / "results.csv", index=False
+    )
+    data = read_run(run)
+    assert [(math.isnan(row["self"]), row["frame"]) for row in data.results] == [(True, 0.5)] * 2
+    assert any("self (2)" in told for told in data.left_out)
+
+
 @pytest.mark.parametrize("content", [b"no such format", b""])
 def test_a_damaged_copy_is_named(tmp_path: Path, content: bytes) -> None:
     run = written(tmp_path / "run", ".csv.xz")
