@@ -4,12 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from cdpipe.core.names import visible
 
-class TunnelcdError(Exception):
+
+class _ShownError(Exception):
+    """Text that may hold names of users and files: all that is not shown as it is but ends of lines is escaped."""
+
+    def __str__(self) -> str:
+        return "\n".join(map(visible, super().__str__().split("\n")))
+
+
+class TunnelcdError(_ShownError):
     """Base of every error caused by the input; its text says what is wrong, where, what is expected, and a remedy."""
 
 
-class InputWarning(UserWarning):
+class InputWarning(_ShownError, UserWarning):  # noqa: N818 - it is a warning
     """Input that is used, though not as it is; the text says what was left out."""
 
 

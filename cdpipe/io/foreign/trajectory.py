@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from cdpipe.core.errors import InputError, InputWarning
 from cdpipe.core.geometry import BoolArray, Float64Array, make_pose, travelled_m
 from cdpipe.core.geometry.motion import Motion, make_motion
-from cdpipe.core.names import visible
 from cdpipe.io.foreign.columns import MOST_COLUMNS, TIME_UNITS_S, find_columns, find_rivals, is_header
 from cdpipe.io.tum import TUM_LINE, iterate_lines, read_tum, require_unit_poses
 
@@ -239,7 +238,7 @@ def _read_csv(path: Path, names: list[str], lines: Iterable[tuple[int, str]]) ->
     turns = [name for name in ("qx", "qy", "qz", "qw") if name in columns]
     angles = [name for name in ("roll", "pitch", "yaw") if name in columns]
     if not {"x", "y", "z"} <= set(columns) or (len(turns) < 4 and len(angles) < 3):
-        named = visible(", ".join(names)[:120])
+        named = ", ".join(names)[:120]
         raise InputError(
             f"{path}: its header names {named}: expected x, y, z, and qx, qy, qz, qw or roll, pitch, yaw, and time for "
             "scans at other times"
