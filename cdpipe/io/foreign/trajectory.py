@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from array import array
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
@@ -14,9 +13,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cdpipe.core.errors import InputError, InputWarning
+from cdpipe.core.errors import InputError
 from cdpipe.core.geometry import BoolArray, Float64Array, make_pose, travelled_m
 from cdpipe.core.geometry.motion import Motion, make_motion
+from cdpipe.io.foreign.angles import are_degrees, require_turns
 from cdpipe.io.foreign.columns import MOST_COLUMNS, TIME_UNITS_S, find_columns, find_rivals, is_header
 from cdpipe.io.tum import TUM_LINE, iterate_lines, read_tum, require_unit_poses
 
@@ -28,8 +28,6 @@ _NOMINAL_S = 0.1  # between scans, where there is one scan only
 _LONGEST_GAP_S = 1.0
 _SECONDS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # from this median on, stamps are ns, us, ms
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?")
-_RADIANS = np.pi + 1e-3  # rounded to three digits; angles up to here are taken for radians without a unit
-_DEGREES = 7.0  # from here on they are degrees
 _MOST_COMMENTS = 100  # right before the first pose, that may be a header
 
 
@@ -74,7 +72,8 @@ def read_poses(path: Path) -> Trajectory:
 
     Raises:
         InputError: The file is none of these, a number is not finite, a rotation is none, times other than TUM's do not
-            rise, or angles may be degrees or radians. Radians without a unit in the header are an `InputWarning`.
+            rise, angles may be degrees or radians, or yaws turn as the path does in the other unit alone or clockwise.
+            Radians without a unit in the header are an `InputWarning`.
     """
     lines = _lines(path)
     first = next(lines, None)
@@ -249,10 +248,11 @@ def _read_csv(path: Path, names: list[str], lines: Iterable[tuple[int, str]]) ->
     if len(turns) == 4:
         poses = _poses(path, rows[:, :7], numbers)
     else:
-        is_degrees = _are_degrees(path, rows[:, 3:6], [names[columns[name]].lower() for name in angles])
+        is_degrees = are_degrees(path, rows[:, 3:6], [names[columns[name]].lower() for name in angles])
         rotations = Rotation.from_euler("xyz", rows[:, 3:6], degrees=is_degrees)
         _poses(path, np.column_stack([rows[:, :3], rotations.as_quat()]), numbers)  # which refuses what is no pose
         poses = make_pose(rotations.as_matrix(), rows[:, :3])
+        require_turns(path, rows[:, 5], poses, is_degrees=is_degrees)
     time_s = _add_clocks(rows[:, len(used) :], [names[index] for index in clocks]) if clocks else None
     return Trajectory(str(path), poses, None if time_s is None else _rising(path, time_s))
 
@@ -272,26 +272,6 @@ def _add_clocks(stamps: Float64Array, names: Sequence[str]) -> Float64Array:
         return last * TIME_UNITS_S[unit]
     is_rest = stamps.shape[1] == 2 and bool((np.abs(last) < 1e9).all())
     return stamps[:, 0] + 1e-9 * last if is_rest else _seconds(last)  # nanoseconds from 1e9 on are whole stamps
-
-
-def _are_degrees(path: Path, angles: Float64Array, names: Sequence[str]) -> bool:
-    """Return whether angles (N, 3) are degrees: by the unit in the header, else by their size.
-
-    Raises:
-        InputError: They could be either.
-    """
-    if any("deg" in name or "rad" in name for name in names):
-        return any("deg" in name for name in names)
-    largest = float(np.abs(angles).max(initial=0.0))
-    if _RADIANS < largest <= _DEGREES:
-        raise InputError(
-            f"{path}: the largest of roll, pitch and yaw is {largest:.3f}, which may be degrees or radians: say which "
-            "in the header, as roll_deg,pitch_deg,yaw_deg or roll_rad,pitch_rad,yaw_rad"
-        )
-    if 0.0 < largest <= _RADIANS:
-        told = "roll, pitch and yaw are taken for radians: say so in the header (yaw_rad, or yaw_deg for degrees)"
-        warnings.warn(f"{path}: {told}", InputWarning, stacklevel=2)
-    return largest > _DEGREES
 
 
 def _numbers(

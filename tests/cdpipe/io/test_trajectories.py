@@ -258,6 +258,52 @@ def test_the_unit_of_angles_is_that_of_the_header(tmp_path: Path) -> None:
         assert yaw_rad("", 0.5) == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize("mount_deg", [0.0, 90.0, -160.0])
+@pytest.mark.parametrize("is_backwards", [False, True])
+@pytest.mark.parametrize(
+    ("unit", "scale", "said"),
+    [
+        ("_deg", 1.0, None),
+        ("_rad", np.pi / 180.0, None),
+        ("_deg", np.pi / 180.0, "likely they are radians, taken for degrees"),
+        ("_rad", 1.0, "likely they are degrees, taken for radians"),
+        ("_deg", -1.0, "likely they grow clockwise"),
+    ],
+)
+def test_yaws_that_do_not_turn_as_the_path_does_are_refused_with_the_likely_mend(
+    tmp_path: Path, unit: str, scale: float, said: str | None, mount_deg: float, is_backwards: bool
+) -> None:
+    rng = np.random.default_rng(3)
+    turns_rad = np.linspace(0.0, np.pi / 2.0, 200)
+    yaws = (np.degrees(turns_rad) + mount_deg + rng.normal(0.0, 2.0, 200)) * scale
+    rows = np.column_stack([20.0 * np.sin(turns_rad), 20.0 * (1.0 - np.cos(turns_rad)), np.zeros((200, 3)), yaws])
+    path = tmp_path / "curve.csv"
+    text = "\n".join(",".join(f"{number:.6f}" for number in row) for row in (rows[::-1] if is_backwards else rows))
+    path.write_text(f"x,y,z,roll{unit},pitch{unit},yaw{unit}\n{text}\n")
+    if said is None:
+        assert len(read_poses(path).poses) == 200
+    else:
+        with pytest.raises(InputError, match=f"curve.csv: the yaws do not turn as the path does, .*{said}"):
+            read_poses(path)
+
+
+@pytest.mark.parametrize("kind", ["sways", "looks around", "stands"])
+def test_yaws_that_tell_nothing_of_their_unit_are_taken_as_they_are(tmp_path: Path, kind: str) -> None:
+    rng = np.random.default_rng(4)
+    yaws = rng.uniform(-180.0, 180.0, 100) if kind == "looks around" else rng.normal(0.0, 3.0, 100)
+    step_m = 0.0 if kind == "stands" else 1.0
+    rows = "".join(f"{place * step_m},{rng.normal(0.0, 0.01)},0,0,0,{yaw}\n" for place, yaw in enumerate(yaws))
+    path = tmp_path / "walk.csv"
+    path.write_text(f"x,y,z,roll_deg,pitch_deg,yaw_deg\n{rows}")
+    assert len(read_poses(path).poses) == 100
+    path.write_text(f"x,y,z,roll_rad,pitch_rad,yaw_rad\n{rows}")
+    if kind == "sways":  # by three radians, which no path along a line has
+        with pytest.raises(InputError, match="likely they are degrees, taken for radians"):
+            read_poses(path)
+    else:
+        assert len(read_poses(path).poses) == 100
+
+
 def test_a_header_right_before_the_poses_holds_behind_many_comments(tmp_path: Path) -> None:
     path = tmp_path / "t.txt"
     path.write_text("# note\n" * 300 + "# time x y z qw qx qy qz\n0 1 2 3 1 0 0 0\n1 1 2 4 1 0 0 0\n")
