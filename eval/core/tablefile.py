@@ -61,6 +61,11 @@ def plain_texts(frame: pd.DataFrame) -> pd.DataFrame:
     return plain.rename(columns=_as_text)
 
 
+def csv_text(frame: pd.DataFrame) -> str:
+    """Return a table of a page as CSV: its texts may come from a stranger's files, and a spreadsheet runs none."""
+    return str(plain_texts(frame).to_csv(index=False))
+
+
 def _as_text(value: Any) -> Any:
     if not isinstance(value, str):
         return value

@@ -14,6 +14,7 @@ import pandas as pd
 from eval.core.domains import domain_name
 from eval.core.output import make_writable
 from eval.core.statistics import interval_over_tunnels, mean, median, statistic_of
+from eval.core.tablefile import csv_text
 from eval.core.terminal.printing import count_pairs
 from eval.leaderboard.calls import list_merges
 from eval.leaderboard.reference import take_other_methods, why_no_pair
@@ -98,7 +99,7 @@ def write_tables_of(found: Comparison, folder: Path) -> None:
     """
     make_writable(folder)
     for file, table in (("table", found.table), ("differences", found.pairs), ("comparison", found.paired)):
-        write_file(folder / f"{file}.csv", table.to_csv(index=False))
+        write_file(folder / f"{file}.csv", csv_text(table))
 
 
 def list_lines(found: Comparison) -> list[str]:

@@ -21,6 +21,7 @@ from cdpipe.model.config import settings_table
 from eval.core.charts import BLACK, BLUE, CONTEXT, ORANGE, VERMILLION
 from eval.core.output import require_no_links
 from eval.core.statistics import ENOUGH_PAIRS
+from eval.core.tablefile import csv_text
 from eval.core.terminal.progress import RunProgress
 from eval.plans.targets import read_targets
 from eval.report.cost import draw_pareto, pareto_table
@@ -127,17 +128,17 @@ def _draw(data: RunData, views: Views, kept: KeptPage, *, is_slim: bool) -> dict
     content = _about(data, merges) | {"merge": draw_merge(merging)}
     files: dict[str, str | bytes] = {**latex_tables(data)}
     if len(merges):
-        files["merge.csv"] = merge_table(every, targets).to_csv(index=False)
+        files["merge.csv"] = csv_text(merge_table(every, targets))
     if not ends_at_merge(data):
         hardness = draw_hardness(data)
         if hardness is not None:
             files["breaking_points.tex"] = to_latex(hardness.table)
         points = pareto_table(data)
         if len(points):
-            files["pareto.csv"] = points.to_csv(index=False)
+            files["pareto.csv"] = csv_text(points)
         crossed = factorial_table(data)
         if len(crossed):
-            files["factorial.csv"] = crossed.to_csv(index=False)
+            files["factorial.csv"] = csv_text(crossed)
         drawn = {
             "hardness": () if hardness is None else hardness.plots,
             "pareto": draw_pareto(points, is_contended=is_contended(data)),

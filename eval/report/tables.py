@@ -13,6 +13,7 @@ import pandas as pd
 
 from eval.core.domains import domain_name
 from eval.core.statistics import ENOUGH_PAIRS
+from eval.core.tablefile import csv_text
 from eval.report.drawing.charts import Chart
 from eval.running.results.cases import BEST_POINTS, named_variants, scenarios, shows_best_points
 from eval.running.results.run_data import RunData
@@ -217,7 +218,7 @@ def to_csv(table: Table) -> str:
     """Return a table as CSV, the group as its first column; "–" is left empty, numbers hold no thin spaces."""
     rows = [(group, *(cell.text for cell in cells)) for group, cells in table.rows]
     frame = pd.DataFrame(rows, columns=["scenario", *table.headings])
-    return str(frame.map(lambda word: "" if word == UNDEFINED else word.replace(THIN_SPACE, "")).to_csv(index=False))
+    return csv_text(frame.map(lambda word: "" if word == UNDEFINED else word.replace(THIN_SPACE, "")))
 
 
 def methods_table(

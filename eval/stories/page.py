@@ -14,6 +14,7 @@ from cdpipe.core.geometry import Float64Array
 from cdpipe.model.report import SurfaceField
 from eval.core.charts import BLUE, CONTEXT, ORANGE, Axis, Drawing, Look, Panel, Series
 from eval.core.figures import data_address
+from eval.core.tablefile import csv_text
 from eval.report.drawing.charts import Chart
 from eval.report.render import render_page, write_file
 from eval.report.surface.unrolled import draw_panels
@@ -49,8 +50,8 @@ def write_story_page(
     places = choose_places(comparisons, given)
     moved, props = follow_places(comparisons, places), follow_props(comparisons)
     content = _content(story, method, comparisons, (places, moved, props))
-    write_file(out / "displacement.csv", moved.to_csv(index=False))
-    write_file(out / "props.csv", props.to_csv(index=False))
+    write_file(out / "displacement.csv", csv_text(moved))
+    write_file(out / "props.csv", csv_text(props))
     write_file(out / "index.html", render_page("story.html", content))
     table = displacement_table(moved, has_truth=False)
     return pd.DataFrame([[cell.text for cell in cells] for _, cells in table.rows], columns=list(table.headings))

@@ -17,6 +17,7 @@ from eval.core.domains import domain_name
 from eval.core.figures import picture_address
 from eval.core.output import make_writable, require_replaceable
 from eval.core.statistics import ENOUGH_PAIRS
+from eval.core.tablefile import csv_text
 from eval.report.comparing.columns import COMPARED
 from eval.report.comparing.differences import (
     BETTER,
@@ -97,7 +98,7 @@ def write_comparison(found: Comparison, folder: Path) -> Path:
     make_writable(folder)
     require_replaceable(folder / "comparison.csv", ",".join(COLUMNS[:2]).encode(), "table of `tunnelcd report A B`")
     require_replaceable(folder / "comparison.html", b"<title>tunnelcd: ", "page of `tunnelcd report A B`")
-    table, page = found.table.to_csv(index=False), render_page("comparison.html", _content(found))
+    table, page = csv_text(found.table), render_page("comparison.html", _content(found))
     write_files({folder / "comparison.html": page, folder / "comparison.csv": table})
     return folder / "comparison.html"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import html
 import re
 from html.parser import HTMLParser
@@ -27,6 +28,7 @@ HOSTILE = (
     "<!--<script>", f"</script><script>{RUN}</script>", f"<img src=x onerror=\"{RUN}\">\" onmouseover=\"{RUN}\" x=\"",
     "<b>bold</b> &lt;i&gt; <a href=\"javascript:alert(1)\">x</a>", "%{x} %{y:.3f} {{ 7 * 7 }} {% include 'page.css' %}",
     r"$\frac$ \input{/etc/passwd}", "_hidden $x_1$ and $y", "a\x1b[2Jb\u202ec\u2028]]>-->", "[2cm] *", "*",
+    '=1+cmd|"/C calc"!A0', "+1-2+cmd|x!A0",
 )  # fmt: skip
 PLAIN = tuple(f"method {place}" for place in range(len(HOSTILE)))
 
@@ -94,6 +96,18 @@ def test_every_name_stands_on_the_page_as_it_is(pages: dict[str, Path]) -> None:
     text = html.unescape(pages["bad"].read_text())
     assert [name for name in map(shown, HOSTILE) if name not in text] == []
     assert not re.search("[\x1b\u202e\u2028]", text)
+
+
+def test_no_name_is_a_formula_in_a_table_beside_the_page(pages: dict[str, Path], tmp_path: Path) -> None:
+    sides = [read_side(f"{pages['bad'].parent}:{name}") for name in HOSTILE[-2:]]
+    write_comparison(compare_sides(*sides), tmp_path)
+    tables = [path for path in pages["bad"].parent.glob("*.csv") if path.name != "results.csv"] + [
+        *tmp_path.glob("*.csv")
+    ]
+    cells = [cell for path in tables for row in csv.reader(path.read_text().splitlines()) for cell in row]
+    assert {path.name for path in tables} >= {"comparison.csv", "merge.csv", "pareto.csv", "table1.csv"}
+    assert any(cell.startswith("'=1+cmd") for cell in cells) and any(cell.startswith("'+1-2+cmd") for cell in cells)
+    assert not [cell for cell in cells if re.match(r"[=@]|[+-].*[a-z|!]", cell)]
 
 
 @needs_browser
